@@ -18,6 +18,7 @@ from pipeline.analysis.branches.resting import RestSettings, last_orbit, saddles
 from pipeline.analysis.branches.steep_orbits import (
     CutProblem,
     cut_where_steep,
+    is_divided,
     is_small,
     is_steep,
     is_steeper,
@@ -273,6 +274,8 @@ def _past_steep(
         if cut is None:
             break
         problem, start = cut
+        if last is None and not (is_steep(found.points[-1], family) or is_divided(problem)):
+            break  # the period grows, but not on a canard
         own = Watch(problem, settings, n_steps=len(found.points) - 1)
         n_left = settings.max_points - len(found.points) + 1
         rest = replace(settings, max_points=n_left, longest_step=settings.longest_cut)

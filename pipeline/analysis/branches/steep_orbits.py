@@ -69,6 +69,11 @@ def is_small(point: Point, cuts: CutSettings = CutSettings()) -> bool:
     return bool(point.value.extents.max() < cuts.small)
 
 
+def is_divided(problem: CutProblem, cuts: CutSettings = CutSettings()) -> bool:
+    """Return whether tangents grow so much along an orbit that it was cut into more than the fewest segments."""
+    return len(problem.shares) > cuts.least_segments
+
+
 def flown(family: Family, rows: Rows, seconds: np.ndarray, atol: float) -> tuple[np.ndarray, np.ndarray]:
     """Return states after a time each, shape (m, n_states), and their derivatives by the start, (m, n_states,
     n_states).
