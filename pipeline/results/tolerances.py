@@ -12,7 +12,7 @@ from __future__ import annotations
 BRANCH_RTOL = 1e-12
 """Orbits on branches: residuals go below 1e-10, and differences by a parameter keep six digits."""
 
-CONNECT_RTOL = 1e-9
+CONNECT_RTOL = 1e-8
 """Orbits that are followed from one parameter value to the next only to see which others they meet."""
 
 SEARCH_RTOL, SEARCH_CLOSE = 1e-8, 1e-7

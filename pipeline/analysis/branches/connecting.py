@@ -9,8 +9,9 @@ at once:
   shorter steps where the test fails. The new orbit is linked, and followed further.
 * An orbit of even period that reaches the orbit of half its period, at a period doubling, continues as that orbit.
 
-An orbit ends where a branch turns back in the parameter (fold). The end is open if it could not be shown to be one, or
-where the orbit is very unstable.
+An orbit ends where a branch turns back in the parameter (fold). A fold is foreseen where det(1 - M) falls to 0 and the
+slope rises, and it is one if a step beyond finds no orbit. Where a symmetric orbit loses its symmetry, det(1 - M) also
+passes 0, but the orbit goes on. The end is open if no fold could be shown, or where the orbit is very unstable.
 Sheets are followed only as far as they can meet others: the smaller of two, and not where both have orbits at one
 point.
 """
@@ -69,7 +70,7 @@ class _Flood(Orbits):
         numbers = "u end h shortest det det_before u_before gap sign limit reach end_at"
         walk: Any = [(k, "i8") for k in ("origin", "axis", "way", "period", "halvings", "stage", "tries")]
         walk += [(k, "f8") for k in numbers.split()]
-        walk += [(k, "f8", n) for k in ("z", "slope", "half")]
+        walk += [(k, "f8", n) for k in ("z", "slope", "slope_before", "half")]
         walk += [(k, "?") for k in ("is_fold", "has_moved", "is_rough", "is_ending")]
         self.walk: Any = np.zeros(0, walk)
 
@@ -224,9 +225,10 @@ class _Flood(Orbits):
             w[k][passed | fixed] = value[passed | fixed]
         w["sign"][passed & ~same] = 0.0
         w["tries"] += 1
-        # an orbit after one Newton step is good enough for a step as long, not for shorter ones
         refused = is_step & ~passed & ~lost
-        w["stage"][(passed & last) | (refused & w["is_rough"])] = _SETTLE
+        ended = refused & w["is_ending"] & ~(good & (error <= self.settings.beyond))
+        # an orbit after one Newton step is good enough for a step as long, not for shorter ones
+        w["stage"][(passed & last) | (refused & w["is_rough"] & ~ended)] = _SETTLE
         w["tries"][is_step] = 0
         w["is_ending"] = self._foresees_an_end(w, passed)
         w["is_rough"][passed], w["is_rough"][settled] = ~converged[passed], False
@@ -235,14 +237,29 @@ class _Flood(Orbits):
         w["h"][refused] *= np.clip(np.nan_to_num(0.7 * self.settings.near / error[refused], nan=0.25), 0.25, 0.5)
         self._begin_half(w, fixed & (w["stage"] == _HALVE) & converged, v)
         w["reach"][is_step] = w["h"][is_step]
+        self._keep_off_zero(w, passed, refused)
         w["h"] = np.minimum(w["h"], np.minimum(np.abs(w["end"] - w["u"]), _longest(w["slope"], self.settings)))
-        self._finish(w, arrived, lost | (~is_step & ~fixed), refused, np.maximum(h, w["shortest"]), v)
+        self._finish(w, arrived, lost | (~is_step & ~fixed), ended, np.maximum(h, w["shortest"]), v)
 
     def _take(self, w: Any, passed: Array, u: Array, det: Array) -> None:
         for before, now, value in (("u_before", "u", u), ("det_before", "det", det)):
             w[before][passed] = w[now][passed]
             w[now][passed] = value[passed]
+        w["slope_before"][passed] = w["slope"][passed]
         w["has_moved"][passed] = True
+
+    def _keep_off_zero(self, w: Any, passed: Array, refused: Array) -> None:
+        """Change steps that would end where det(1 - M) vanishes, as Newton's method has no direction there.
+
+        A step goes as far beyond as the orbit is before; if this step is refused, the next goes half of the way. At a
+        fold no orbit is beyond. An orbit that loses its symmetry goes on.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            zero = np.abs(w["u"] - w["u_before"]) * w["det"] / (w["det_before"] - w["det"])
+        close = w["has_moved"] & (w["h"] > 0.5 * zero) & (w["h"] < 2.0 * zero)
+        over = passed & (close | w["is_ending"])
+        w["h"][over], w["stage"][over] = 2.0 * zero[over], _SETTLE
+        w["h"][refused & close] = 0.5 * zero[refused & close]
 
     def _foresees_an_end(self, w: Any, passed: Array) -> Array:
         """Return whether two steps foresee a fold or a doubling at one value before the next point."""
@@ -252,7 +269,14 @@ class _Flood(Orbits):
         near = (ahead > 0.0) & (ahead <= 4.0 * np.abs(w["u"] - w["u_before"]))
         with np.errstate(invalid="ignore"):  # both are infinite where the derivative stays constant
             agrees = np.abs(at - before) <= self.settings.agreed * ahead
-        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & agrees)
+        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & agrees & self._steepens(w))
+
+    def _steepens(self, w: Any) -> Array:
+        """Return whether a slope has a part that grows as det(1 - M) falls, as it does towards a fold or a doubling."""
+        slope = w["slope"]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            part = (slope - w["slope_before"]) * (w["det_before"] / (w["det_before"] - w["det"]))[:, None]
+        return np.asarray((part * slope).sum(axis=1) >= self.settings.singular * (slope**2).sum(axis=1))
 
     def _begin_half(self, w: Any, ready: Array, v: Values) -> None:
         """Go on with orbits of half the period: the next step must pass a doubling of theirs."""
@@ -261,14 +285,14 @@ class _Flood(Orbits):
         w["halvings"][ready] += 1
         w["det"][ready], w["has_moved"][ready] = v.det[ready], False
 
-    def _finish(self, w: Any, arrived: Array, lost: Array, refused: Array, tried: Array, v: Values) -> None:
+    def _finish(self, w: Any, arrived: Array, lost: Array, ended: Array, tried: Array, v: Values) -> None:
         """Take the orbits that arrived, halve those that reach a doubling, and end those that are stuck."""
         short = np.minimum(
             w["shortest"] * np.where(w["has_moved"], 1.0, self.settings.before_first), np.abs(w["end"] - w["u"])
         )
-        stuck = ~arrived & (w["stage"] == _STEP) & ((w["h"] < short) | (w["h"] <= 1e-12) | w["is_ending"])
+        stuck = ~arrived & (w["stage"] == _STEP) & ((w["h"] < short) | (w["h"] <= 1e-12) | ended)
         ahead = _distance_to_fold(w)
-        fold = w["has_moved"] & (ahead > 0.0) & (ahead < 10.0 * tried)
+        fold = w["has_moved"] & (ahead > 0.0) & (ahead < 10.0 * tried) & self._steepens(w)
         first = stuck & (w["halvings"] == 0)
         w["is_fold"][first] = fold[first]
         halves = (

@@ -37,6 +37,10 @@ class SheetSettings:
     collapsed: float = 0.2
     halved: float = 0.2  # largest distance of the two halves of an orbit at a period doubling
     agreed: float = 0.1  # largest difference between two estimates of where a fold is, as a share of its distance
+    singular: float = 0.25  # least share of a slope's part that grows as det(1 - M) falls, before a fold
+    beyond: float = (
+        0.5  # Newton step beyond a foreseen fold, as a share of the step's length, above which the orbit ends
+    )
     together: int = 8  # Newton steps of all orbits on their way before others are sent; fewer follow fewer in vain
     corrections: int = 6  # most Newton steps at one point
 
@@ -278,7 +282,9 @@ class Orbits:
         keys = self._key(new["period"], new["place"])
         own, other = np.nonzero((keys[:, None] == keys) & (np.arange(m)[:, None] > np.arange(m)))
         a, b = np.concatenate([a, n + own]), np.concatenate([b, n + other])
-        same = self._nearest(self.nodes["points"][a, 0], b)[0] <= SAME_CONNECTED
+        # points after the first are images of a state before its last Newton step, whose length the map has stretched
+        reach = SAME_CONNECTED * np.maximum(1.0, np.abs(self.nodes["det"][a]))
+        same = self._nearest(self.nodes["points"][a, 0], b)[0] <= reach
         known = np.arange(n, n + m)
         np.minimum.at(known, a[same] - n, b[same])
         among = known >= n

@@ -92,6 +92,50 @@ def test_connect__beyond_a_fold_is_another_branch(resonance):
     assert found.ways[0, 0, 0] == ENDED
 
 
+Y = 1.0 / (1.0 + 4.0 * np.pi**2)
+"""State of y' = -y + cos(2 pi t) at the strobe."""
+
+
+@pytest.mark.parametrize(
+    ("rate", "middle", "low", "high"),
+    [
+        ("0.2 - sqrt(0.3 - b)", "b", -0.6, 0.29),  # det(1 - M) falls towards its zero as before a fold
+        ("4*b", "exp(-6*b)", -0.3, 0.1),
+        ("60*b", "exp(-15*b)", -0.05, 0.05),  # the slope changes much over the steps near the zero
+    ],
+)
+def test_connect__an_orbit_that_loses_its_symmetry_goes_on(rate, middle, low, high):
+    """At a pitchfork det(1 - M) changes its sign, and the symmetric orbit is on both sides. At a fold there is none."""
+    away = f"(x - {middle})"
+    model = load_model(table("fork", {"x": f"({rate})*{away} - {away}^3", "y": "-y + cos(2*pi*f*t)"}, {"b": 0.0}))
+    values = np.array([low, high])
+    column = model.system.parameter_names.index("b")
+    packed = np.zeros((2, len(model.system.parameter_names)))
+    packed[:, column] = values
+    grid = Grid(model.system, (2,), packed, np.ones(2), (Axis(0, column, values),))
+    states = [eval(middle, {"b": value, "exp": np.exp}) for value in values]
+    orbits = [np.array([[x, Y]]) for x in states]
+    assert connect(grid, np.array([0, 1]), orbits).links.tolist() == [[0, 1, 0]]
+    for first in (0, 1):  # from each side to the other
+        found = connect(grid, np.array([first, 1 - first]), [orbits[first], orbits[1 - first] + [5.0, 0.0]])
+        assert found.ways[0, 0].tolist() == [[LINKED, BORDER], [BORDER, LINKED]][first]
+
+
+def test_taken__an_unstable_orbit_is_known_at_each_phase(wells):
+    """Section points after the first are off by a Newton step that the map has stretched."""
+    points = wells(2, 0.28)
+    values = np.array([0.28, 0.29])
+    column = TWIN_WELL.model.system.parameter_names.index("amplitude")
+    packed = np.tile(TWIN_WELL.pack(), (2, 1))
+    packed[:, column] = values
+    grid = Grid(TWIN_WELL.model.system, (2,), packed, np.full(2, FREQUENCY), (Axis(0, column, values),))
+    for off, is_known in ((1e-4, True), (1e-2, False)):
+        flood = connecting._Flood(grid, np.array([0]), [points], connecting.SheetSettings())
+        new = flood.nodes.copy()
+        new["points"][0], new["det"] = points[::-1] + np.array([[off], [0.0]]), -20.0
+        assert (flood._taken(new)[0] == 0) == is_known
+
+
 def test_connect__neighbours_take_no_walk(wells, monkeypatch):
     """Orbits near each other are held against each other's tangent: one evaluation for all."""
     monkeypatch.setattr(connecting._Flood, "_advance", None)
@@ -119,9 +163,6 @@ def test_grouped__no_two_of_one_place_together():
 
 CUSP = load_model(table("cusp", {"x": "a + b*x - x^3", "y": "-y + cos(2*pi*f*t)"}, {"a": 0.0, "b": 0.0}))
 """Two sheets and their fold over a and b, with a cusp at 0, beside a damped state that the drive moves."""
-
-
-Y = 1.0 / (1.0 + 4.0 * np.pi**2)
 
 
 def cusp(places):
