@@ -258,7 +258,8 @@ class _Flood(Orbits):
             zero = np.abs(w["u"] - w["u_before"]) * w["det"] / (w["det_before"] - w["det"])
         close = w["has_moved"] & (w["h"] > 0.5 * zero) & (w["h"] < 2.0 * zero)
         over = passed & (close | w["is_ending"])
-        w["h"][over], w["stage"][over] = 2.0 * zero[over], _SETTLE
+        w["h"][over] = 2.0 * zero[over]
+        w["stage"][over & (~w["is_ending"] | (w["period"] % 2 == 0))] = _SETTLE
         w["h"][refused & close] = 0.5 * zero[refused & close]
 
     def _foresees_an_end(self, w: Any, passed: Array) -> Array:
