@@ -134,6 +134,7 @@ class Watch:
     skip_first: bool = False
     found: list[Bifurcation] = field(default_factory=list)
     n_steps: int = 0
+    tell: Callable[[Bifurcation], None] = lambda _: None  # called with each one at once
     _last: Point | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
@@ -163,7 +164,10 @@ class Watch:
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
-        self.found += tell_apart(located, a)
+        told_apart = tell_apart(located, a)
+        self.found += told_apart
+        for one in told_apart:
+            self.tell(one)
         self.n_steps += 1
         self._last = a
         return True

@@ -11,8 +11,9 @@ value. Larger cycles often cross the section of the run as well.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -37,9 +38,9 @@ from pipeline.analysis.branches.following import (
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF
 from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others, shorter_orbit
 from pipeline.analysis.branches.limits import settle_limits
-from pipeline.analysis.branches.lockstep import Steps, run_alone, run_together
+from pipeline.analysis.branches.lockstep import Begun, Query, Steps, run_alone, run_together
 from pipeline.analysis.branches.normal_forms import judge
-from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.branches.problems import Family, OrbitProblem, Value
 from pipeline.results.tolerances import BRANCH_RTOL
 
 FOLLOWING = "following branches"
@@ -61,6 +62,71 @@ class Scope:
     settings: Settings = field(default_factory=Settings)  # settings of the traces
 
 
+@dataclass(eq=False)
+class _Doubled:
+    """Branches that spring from period doublings, followed from these on beside the branches on which they lie.
+
+    A branch of twice the period that is being followed may end at a doubling, whose other branch it then is. So each
+    of these branches holds the doubling that is nearest to its latest orbit: nothing is followed from there as yet.
+    """
+
+    scope: Scope
+    _located: dict[Value, tuple[Family, Bifurcation]] = field(default_factory=dict)  # by its orbit; nothing begun
+    _begun: dict[Value, Begun[Half | None]] = field(default_factory=dict)
+    _latest: dict[OrbitProblem, np.ndarray] = field(default_factory=dict)  # unknowns on each branch
+
+    def half(self, family: Family, start: Point, from_bifurcation: bool = False) -> Steps[Half]:
+        """Follow one half of a branch, and note the period doublings on it."""
+        low, high, settings = self.scope.low, self.scope.high, self.scope.settings
+        return half_branch(family, start, low, high, settings, from_bifurcation, partial(self._note, family))
+
+    def _note(self, family: Family, one: Bifurcation) -> None:
+        if self._leads_on(family, one) and self.scope.low <= family.values(one.point.u)[0] <= self.scope.high:
+            self._located[one.point.value] = family, one
+
+    def _leads_on(self, family: Family, one: Bifurcation) -> bool:
+        """Return whether the other branch at a bifurcation is one of twice the period, within the limit of periods."""
+        return one.kind == DOUBLING and 2 * family.period <= self.scope.max_period
+
+    def beside(self, queries: Sequence[Query]) -> Iterable[Begun[Half | None]]:
+        """Begin branches at the doublings that no branch holds; return all that have been begun."""
+        self._latest |= {query.problem: query.u for query in queries if isinstance(query.problem, OrbitProblem)}
+        held = {self._nearest(*latest) for latest in self._latest.items()} if self._located else set()
+        for end in [end for end in self._located if end not in held]:
+            self._begun[end] = Begun(self._branch(*self._located.pop(end)))
+        return self._begun.values()
+
+    def _nearest(self, problem: OrbitProblem, u: np.ndarray) -> Value | None:
+        """Return the nearest doubling at which a branch may end; None if there is none of half its period."""
+        period = problem.family.period
+        near = [(end, one) for end, (family, one) in self._located.items() if 2 * family.period == period]
+        away = {end: float(np.linalg.norm(one.point.u - u)) for end, one in near}
+        return min(away, key=away.__getitem__, default=None)
+
+    def follow(self, branches: Sequence[Branch], what: str) -> list[tuple[Branch, Bifurcation, Half]]:
+        """Follow to its end the branch at each doubling on some branches from which none is known."""
+        ends = [(branch, one) for branch in branches for one in branch.bifurcations if one.child is None]
+        ends = [(branch, one) for branch, one in ends if self._leads_on(branch.family, one)]
+        self._located.clear()  # branches that are known now have ended at the others
+        self._latest.clear()
+        begun = [self._begun.pop(one.point.value, None) for _, one in ends]
+        halves = run_together(
+            [
+                self._branch(b.family, one) if own is None else own.rest()
+                for (b, one), own in zip(ends, begun, strict=True)
+            ],
+            what,
+            beside=self.beside,
+        )
+        return [(b, one, half) for (b, one), half in zip(ends, halves, strict=True) if half is not None]
+
+    def _branch(self, family: Family, one: Bifurcation) -> Steps[Half | None]:
+        start = yield from doubled_start(family, one)
+        if start is None:
+            return None
+        return (yield from self.half(replace(family, period=2 * family.period), start, from_bifurcation=True))
+
+
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
     """Follow the branches of all starting orbits, and the branches that start at the bifurcations on them.
 
@@ -70,13 +136,14 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
         Branches of the starts in their order, then those of each generation.
     """
     branches: list[Branch] = []
-    _follow_starts(starts, branches, scope)
+    doubled = _Doubled(scope)
+    _follow_starts(starts, branches, doubled)
     for generation in range(scope.max_generations):
         n_known = len(branches)
-        _follow_starts(_adopt(branches), branches, scope)
+        _follow_starts(_adopt(branches), branches, doubled)
         _adopt(branches)
-        _switch(branches, scope, f"{FOLLOWING} that spring from others, round {generation + 1}")
-        _leave_equilibria(branches, scope)
+        _switch(branches, doubled, f"{FOLLOWING} that spring from others, round {generation + 1}")
+        _leave_equilibria(branches, doubled)
         if len(branches) == n_known:
             break
     _adopt(branches)
@@ -87,7 +154,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
     return branches
 
 
-def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope) -> None:
+def _follow_starts(starts: Sequence[Start], branches: list[Branch], doubled: _Doubled) -> None:
     """Follow the branch of each starting orbit that lies on no known branch, and append it to `branches`.
 
     When a start is followed, so are the others at its value, and the first start of each other attractor, on
@@ -95,7 +162,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
     dropped.
     """
     values = {value: i for i, value in enumerate(dict.fromkeys(start.value for start in starts))}
-    starts = [s for s in starts if s.family.period <= scope.max_period]
+    starts = [s for s in starts if s.family.period <= doubled.scope.max_period]
     starts.sort(key=lambda start: values[start.value])
     followed: dict[int, Branch | None] = {}
     is_known, n_compared = np.zeros(len(starts), bool), 0
@@ -110,7 +177,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
             here = [k for k in range(i, len(starts)) if starts[k].value == start.value and not is_known[k]]
             here += _first_of_each(starts, {*followed, *here})
             what = f"{FOLLOWING} from {start.value:g}"
-            followed |= zip(here, _both_ways([starts[k] for k in here], scope, what), strict=True)
+            followed |= zip(here, _both_ways([starts[k] for k in here], doubled, what), strict=True)
         branch = followed[i]
         if branch is not None:
             branches.append(branch)
@@ -124,16 +191,13 @@ def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
     return sorted(firsts.values())
 
 
-def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:
-    firsts = run_together([_first(start, scope.settings) for start in starts])
+def _both_ways(starts: Sequence[Start], doubled: _Doubled, what: str) -> list[Branch | None]:
+    firsts = run_together([_first(start, doubled.scope.settings) for start in starts])
     pairs = [pair for pair in firsts if pair is not None]
     halves = run_together(
-        [
-            half_branch(family, way, scope.low, scope.high, scope.settings)
-            for family, point in pairs
-            for way in (opposite(point), point)
-        ],
+        [doubled.half(family, way) for family, point in pairs for way in (opposite(point), point)],
         what,
+        beside=doubled.beside,
     )
     found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
     return [None if pair is None else next(found) for pair in firsts]
@@ -213,28 +277,10 @@ def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     return _side_criticality(at, 1 if sure[0] > 0.0 else -1)
 
 
-def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
+def _switch(branches: list[Branch], doubled: _Doubled, what: str) -> None:
     """Follow the new branches that start at period doublings and branch points of the known branches."""
-    open_ends = [
-        (branch, one)
-        for branch in branches
-        for one in branch.bifurcations
-        if one.child is None
-        and (one.kind == BRANCHING or (one.kind == DOUBLING and 2 * branch.family.period <= scope.max_period))
-    ]
-    doublings = [(b, one) for b, one in open_ends if one.kind == DOUBLING]
-    starts = run_together([doubled_start(b.family, one) for b, one in doublings])
-    ready = [(b, one, s) for (b, one), s in zip(doublings, starts, strict=True) if s is not None]
-    halves = run_together(
-        [
-            half_branch(
-                replace(b.family, period=2 * b.family.period), start, scope.low, scope.high, scope.settings, True
-            )
-            for b, _, start in ready
-        ],
-        what,
-    )
-    for (parent, one, _), half in zip(ready, halves, strict=True):
+    ends = [(branch, one) for branch in branches for one in branch.bifurcations if one.child is None]
+    for parent, one, half in doubled.follow(branches, what):
         if len(half.trace.points) < 5 or one.child is not None:
             continue
         family = replace(parent.family, period=2 * parent.family.period)
@@ -245,7 +291,7 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
             other = _doubling_at(branches, child, 1)
             if other is not None:
                 other.child, other.criticality = child, _criticality(other, child, -1)
-    crossings = [(b, one) for b, one in open_ends if one.kind == BRANCHING]
+    scope, crossings = doubled.scope, [(branch, one) for branch, one in ends if one.kind == BRANCHING]
     cross(crossings, branches, (scope.low, scope.high), scope.settings)
 
 
@@ -276,9 +322,10 @@ def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcat
     return nearest if away < largest else None
 
 
-def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
+def _leave_equilibria(branches: list[Branch], doubled: _Doubled) -> None:
     """Follow the limit cycles that start at Hopf points, if no known branch of limit cycles ends there."""
     _adopt_cycles(branches)
+    scope = doubled.scope
     points = [
         (branch, one) for branch in branches for one in branch.bifurcations if one.kind == HOPF and one.child is None
     ]
@@ -290,12 +337,12 @@ def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
     for (rest, one, family), half in zip(ready, halves, strict=True):
         if half is not None and len(half.trace.points) > 2 and one.child is None:
             child = Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end), one)
-            parts = _without_known(child, rest.family, branches, scope)
+            parts = _without_known(child, rest.family, branches, doubled)
             one.child = parts[0] if parts else None
             branches += parts
 
 
-def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: Scope) -> list[Branch]:
+def _without_known(cycles: Branch, own: Family, branches: list[Branch], doubled: _Doubled) -> list[Branch]:
     """Return those parts of a branch of limit cycles that are not yet known from another Poincare section.
 
     Diagrams show the section of the run, `own`. So cycles that cross it are followed there, unless they have
@@ -304,14 +351,14 @@ def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: S
     clear = 2  # points of a branch by which cycles are away from where they touch a section
     wanted = np.ones(len(cycles.points), bool)
     for section in _other_sections(cycles, own, branches):
-        crossings = crossings_of(cycles, section, scope.max_period)
+        crossings = crossings_of(cycles, section, doubled.scope.max_period)
         starts = {}
         for first, last in _equal_runs(np.where(wanted, [period for _, period in crossings], 0)):
             state, period = crossings[min(first + clear, last)]
             value = float(cycles.values[min(first + clear, last)])
             starts[first, last] = Start(replace(section, period=period), state, value)
         if section is own:
-            _follow_starts(list(starts.values()), branches, scope)
+            _follow_starts(list(starts.values()), branches, doubled)
         for (first, last), is_known in zip(starts, lie_on(list(starts.values()), branches), strict=True):
             wanted[first : last + 1] &= not is_known
     return _parts(cycles, wanted)

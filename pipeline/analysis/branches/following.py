@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -204,15 +205,21 @@ def first_point(problem: Problem, u: np.ndarray, settings: Settings) -> Steps[Po
 
 
 def half_branch(
-    family: Family, start: Point, low: float, high: float, settings: Settings, from_bifurcation: bool = False
+    family: Family,
+    start: Point,
+    low: float,
+    high: float,
+    settings: Settings,
+    from_bifurcation: bool = False,
+    tell: Callable[[Bifurcation], None] = lambda _: None,
 ) -> Steps[Half]:
     """Follow a branch from a point in one direction to its end. If the last point is beyond a parameter bound, move it
-    onto the bound.
+    onto the bound. `tell` is called with each bifurcation as soon as it is located.
     """
     if not family.period:
         settings = replace(settings, longest_step=settings.longest_at_rest)
     problem = problem_of(family)
-    watch = Watch(problem, settings, skip_first=from_bifurcation)
+    watch = Watch(problem, settings, skip_first=from_bifurcation, tell=tell)
     stop = _Stop(family, low, high, settings.beyond)
     found = yield from trace(
         problem,

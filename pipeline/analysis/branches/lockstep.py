@@ -1,13 +1,19 @@
-"""Run many continuations side by side: each yields a `Query`, and receives the `Value` of its problem."""
+"""Run many continuations side by side: each yields a `Query`, and receives the `Value` of its problem.
+
+A call of the engine costs as much as its groups of `WIDTH` trajectories, full or not. So the trajectories that do not
+fill a group wait for those of the next call.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from pipeline.analysis import together
@@ -16,12 +22,22 @@ from pipeline.products.reporting import report
 from pipeline.results.tolerances import BRANCH_RTOL
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Query:
     """Request to evaluate the equations of a problem at the unknowns `u`."""
 
     problem: Problem
     u: np.ndarray
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The trajectories that the problem needs next."""
+        return self.problem.rows(self.u)
+
+    def value(self, ends: Ends) -> Value | None:
+        """Return the value from the ends of `rows`; None if the problem needs more trajectories, then in `rows`."""
+        del self.rows
+        return self.problem.value(self.u, ends)
 
 
 T = TypeVar("T")
@@ -29,15 +45,47 @@ Steps = Generator[Query, Value, T]
 """A computation that returns a `T`."""
 
 
-def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL) -> list[T]:
+@dataclass(eq=False)
+class Begun(Generic[T]):
+    """A computation that advances beside others before its result is needed."""
+
+    computation: Steps[T]
+    query: Query | None = field(init=False)  # not yet answered; None at the end
+    result: T = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.send(None)
+
+    def send(self, value: Value | None) -> None:
+        """Answer the query, and advance to the next one or to the end."""
+        try:
+            self.query = self.computation.send(value)  # type: ignore[arg-type]
+        except StopIteration as end:
+            self.query, self.result = None, end.value
+
+    def rest(self) -> Steps[T]:
+        """Run the computation from here to its end."""
+        while self.query is not None:
+            self.send((yield self.query))
+        return self.result
+
+
+Beside = Callable[[Sequence[Query]], Iterable[Begun[Any]]]
+"""Function that returns the computations that advance beside others, from the queries of the others."""
+
+
+def run_together(
+    computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL, beside: Beside = lambda _: ()
+) -> list[T]:
     """Run computations side by side to their ends, and return their results in the given order.
 
     If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
     counts by the part of the parameter's interval that it has covered, up to nine tenths. `rtol` is the
-    tolerance of the integrations.
+    tolerance of the integrations. The computations that `beside` returns advance until these have ended.
     """
     covered = [0.0] * len(computations)
     seen: dict[int, tuple[float, float]] = {}
+    waiting: dict[Query, int | Begun[Any]] = {}  # whose they are, in the order in which they were asked
 
     def answer(queries: dict[int, Query], results: Mapping[int, T]) -> dict[int, Value]:
         for i, query in queries.items():
@@ -47,7 +95,20 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
             covered[i] = min(seen[i][1] - seen[i][0], 0.9)
         if what:
             report(what, round(len(results) + sum(covered[i] for i in queries), 1), len(computations))
-        return dict(zip(queries, _evaluate(list(queries.values()), rtol), strict=True))
+        values: dict[int, Value] = {}
+        while not values:
+            for i, query in queries.items():
+                waiting.setdefault(query, i)
+            for begun in beside(list(queries.values())):
+                if begun.query is not None:
+                    waiting.setdefault(begun.query, begun)
+            for query, value in _evaluated(waiting, rtol):
+                owner = waiting.pop(query)
+                if isinstance(owner, Begun):
+                    owner.send(value)
+                else:
+                    values[owner] = value
+        return values
 
     found = together.answer_together(dict(enumerate(computations)), answer)
     if what:
@@ -72,22 +133,33 @@ def run_alone(computation: Steps[T]) -> T:
     return run_together([computation])[0]
 
 
-def _evaluate(queries: Sequence[Query], rtol: float) -> list[Value]:
-    values: list[Value | None] = [None] * len(queries)
-    while open_ones := [i for i, value in enumerate(values) if value is None]:
-        rows = {i: queries[i].problem.rows(queries[i].u) for i in open_ones}
-        for chosen in _calls([(i, queries[i].problem.system) for i in open_ones]):
-            system = queries[chosen[0]].problem.system
-            for i, ends in zip(chosen, integrated([rows[i] for i in chosen], system, rtol), strict=True):
-                values[i] = queries[i].problem.value(queries[i].u, ends)
-    return [value for value in values if value is not None]
+def _evaluated(queries: Iterable[Query], rtol: float) -> list[tuple[Query, Value]]:
+    """Return values of some queries: integrate the next trajectories of those that together fill the engine's lanes."""
+    by_system: dict[str, list[Query]] = {}
+    for query in queries:
+        by_system.setdefault(query.problem.system.label, []).append(query)
+    found = []
+    for asked in by_system.values():
+        chosen = [asked[i] for i in _filling([len(query.rows.states) for query in asked])]
+        ends = integrated([query.rows for query in chosen], chosen[0].problem.system, rtol)
+        values = [query.value(end) for query, end in zip(chosen, ends, strict=True)]
+        found += [(query, value) for query, value in zip(chosen, values, strict=True) if value is not None]
+    return found
 
 
-def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
-    by_system: dict[str, list[int]] = {}
-    for i, system in systems:
-        by_system.setdefault(system.label, []).append(i)
-    return list(by_system.values())
+def _filling(sizes: Sequence[int]) -> list[int]:
+    """Choose queries for a call, the first ones first, by their numbers of trajectories: all, or those that fill whole
+    groups of lanes if the others fill at most half of one.
+    """
+    total = sum(sizes)
+    rest = total % WIDTH if total > WIDTH else 0
+    room = total - rest if rest <= WIDTH // 2 else total
+    chosen: list[int] = []
+    for i, n in enumerate(sizes):
+        if n <= room or not chosen:
+            chosen.append(i)
+            room -= n
+    return chosen
 
 
 def integrated(rows: Sequence[Rows], system: System, rtol: float = BRANCH_RTOL) -> list[Ends]:
