@@ -26,6 +26,7 @@ READERS = {
     ".m": "pipeline.importing.matlab:read",
     **dict.fromkeys((".f90", ".f"), "pipeline.importing.auto:read_fortran"),
     ".c": "pipeline.importing.auto:read_c",
+    **dict.fromkeys((".xml", ".sbml"), "pipeline.importing.sbml:read"),
 }
 """Function that reads the files of a suffix."""
 
@@ -87,7 +88,8 @@ def import_model(path: str | Path) -> Spec:
     Parameters
     ----------
     path
-        A file of XPPAUT (``.ode``), MatCont (``.m``) or AUTO (``.f90``, ``.f``, ``.c``).
+        A file of XPPAUT (``.ode``), MatCont (``.m``) or AUTO (``.f90``, ``.f``, ``.c``); or in SBML (``.xml``,
+        ``.sbml``), with the extra ``sbml``.
 
     Returns
     -------
