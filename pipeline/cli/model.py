@@ -76,7 +76,7 @@ def new(
 def import_(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="File of XPPAUT (.ode), MatCont (.m), AUTO (.f90, .f, .c) or SBML (.xml)."),
+        typer.Argument(metavar="FILE", help="File of XPPAUT (.ode), MatCont (.m), AUTO (.f90, .c) or SBML (.xml)."),
     ],
     out: Annotated[
         Path | None, typer.Option(metavar="NAME.toml", help="File to write; by default named after FILE.")
