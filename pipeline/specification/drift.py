@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 HEADER = ("time_s", "value")
 MOST_CORNERS = 64
-PAIRS = (("rate_per_s", "rate_per_period"), ("start_s", "start_periods"), ("duration_s", "duration_periods"))
+PAIRS = (
+    *(("rate_per_s", "rate_per_period"), ("start_s", "start_periods")),
+    *(("duration_s", "duration_periods"), ("hold_s", "hold_periods")),
+)
 _OF_A_FILE = ("start_s", "start_periods")
 
 
@@ -44,6 +47,8 @@ class DriftTable(Table):
     start_periods: float | None = Field(None, ge=0, description="Start in drive periods, instead of start_s.")
     duration_s: float | None = Field(None, gt=0, description="Duration of the ramp [s].")
     duration_periods: float | None = Field(None, gt=0, description="Duration in drive periods, instead of duration_s.")
+    hold_s: float | None = Field(None, ge=0, description="Time at `to` before the way back [s]; without it none.")
+    hold_periods: float | None = Field(None, ge=0, description="The same in drive periods, instead of hold_s.")
     shape: Literal["linear", "tanh"] = Field(
         "linear", description="linear, or tanh: smooth, five times as steep in the middle as on average."
     )
@@ -227,6 +232,8 @@ def _problems_of_motion(motion: RampOfCells, values: Parameters) -> Iterator[str
         return
     if (motion.start_s < 0).any():
         yield f"drift.{name}: the ramp starts at {motion.start_s.min():g} s; it must start at 0 or later."
+    if motion.hold_s is not None and (motion.hold_s < 0).any():
+        yield f"drift.{name}: the way back begins {motion.hold_s.min():g} s after the ramp's end; give 0 or more."
     parameter = values.model.parameter(name)
     for value in dict.fromkeys((float(ends.min()), float(ends.max()))):
         problem = parameter.problem(value)

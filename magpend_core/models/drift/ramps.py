@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,14 @@ STEEPNESS = 5.0
 """Argument of the tanh at the end of a smooth ramp: its steepest slope is five times its mean slope."""
 
 PER_PERIOD, PERIODS = "_per_period", "_periods"
-NUMBERS = ("from", "to", "rate_per_s", "rate_per_period", "start_s", "start_periods", "duration_s", "duration_periods")
+NUMBERS = (
+    *("from", "to", "rate_per_s", "rate_per_period", "start_s", "start_periods"),
+    *("duration_s", "duration_periods", "hold_s", "hold_periods"),
+)
 """Keys of a ramp's numbers, in the order of the run's parameters."""
+
+WAY_BACK = ("hold_s", "hold_periods")
+"""Keys of a ramp that goes back as it came, after this time at its second value."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,14 @@ class Ramp:
         """Whether the ramp has the shape of a tanh."""
         return self.shape == SMOOTH
 
+    @property
+    def way_out(self) -> Ramp:
+        """The motion up to where it turns: without the way back, or a table up to its value farthest from the first."""
+        if self.shape != TABLE:
+            return replace(self, numbers=tuple((k, v) for k, v in self.numbers if k not in WAY_BACK))
+        last = max(int(np.abs(np.array(self.values) - self.values[0]).argmax()), 1)
+        return replace(self, times_s=self.times_s[: last + 1], values=self.values[: last + 1])
+
 
 def ramp_parameters(ramp: Ramp, unit: str) -> tuple[Parameter, ...]:
     """Return the declarations of the run's parameters that hold a ramp's numbers."""
@@ -76,7 +90,7 @@ def ramp_parameters(ramp: Ramp, unit: str) -> tuple[Parameter, ...]:
             one = f"{unit}/{per[key]}" if unit not in ("", "1") else f"1/{per[key]}"
         else:
             one = unit if key in ("from", "to") else "s" if key.endswith("_s") else "1"
-        what = "start" if key.startswith("start") else "duration"
+        what = key.partition("_")[0]
         found.append(Parameter(name, one, words.get(key, f"{what} of the ramp of {ramp.parameter}")))
     return tuple(found)
 
@@ -92,6 +106,8 @@ class RampOfCells:
         Values before and after [the parameter's unit].
     start_s, duration_s : ndarray, (cell,)
         Of the ramp, or of a table [s since the trajectory's start].
+    hold_s : ndarray, (cell,), or None
+        Time at the value `end` before the parameter goes back as it came [s]; None if it stays there.
     """
 
     ramp: Ramp
@@ -99,20 +115,25 @@ class RampOfCells:
     end: np.ndarray
     start_s: np.ndarray
     duration_s: np.ndarray
+    hold_s: np.ndarray | None = None
 
     @property
     def end_s(self) -> np.ndarray:
         """Time after which the parameter stays where it is, shape (cell,) [s]."""
-        return np.asarray(self.start_s + self.duration_s)
+        back = 0.0 if self.hold_s is None else self.hold_s + self.duration_s
+        return np.asarray(self.start_s + self.duration_s + back)
 
-    def take(self, cells: Any) -> RampOfCells:
-        """Return the motion of some of the cells."""
-        parts = (self.begin, self.end, self.start_s, self.duration_s)
-        return RampOfCells(self.ramp, *(part[cells] for part in parts))
+    @property
+    def final(self) -> np.ndarray:
+        """Value at which the parameter stays at last, shape (cell,) [the parameter's unit]."""
+        return self.end if self.hold_s is None else self.begin
 
     def share(self, cell: int, times: np.ndarray) -> np.ndarray:
-        """Return how far the ramp of a cell has come at given times, from 0 to 1."""
-        return np.asarray(np.clip((times - self.start_s[cell]) / self.duration_s[cell], 0.0, 1.0))
+        """Return how far the parameter of a cell is on the way to its value `end` at given times, from 0 to 1."""
+        come = times - self.start_s[cell]
+        if self.hold_s is not None:
+            come = np.minimum(come, self.end_s[cell] - times)
+        return np.asarray(np.clip(come / self.duration_s[cell], 0.0, 1.0))
 
     def at(self, cell: int, times: np.ndarray) -> np.ndarray:
         """Return the parameter's value of a cell at given times [s since the trajectory's start]."""
@@ -133,7 +154,10 @@ class RampOfCells:
             of its times is split so that no part covers more than this part of the table's range.
         """
         if self.ramp.shape != TABLE:
-            return np.asarray(self.start_s[cell] + self.duration_s[cell] * (np.arange(pieces + 1) / pieces))
+            way = self.start_s[cell] + self.duration_s[cell] * (np.arange(pieces + 1) / pieces)
+            if self.hold_s is None:
+                return np.asarray(way)
+            return np.concatenate([way, way + (self.duration_s[cell] + self.hold_s[cell])])
         times, values = np.asarray(self.ramp.times_s), np.asarray(self.ramp.values)
         if pieces > 1:
             limit = max(float(np.ptp(values)), 1e-300) / pieces
@@ -182,7 +206,8 @@ def motion_of(ramp: Ramp, value_of: Callable[[str], np.ndarray], frequency_hz: n
         else:
             end = given["to"]
             duration = given["duration_s"] if "duration_s" in given else (end - begin) / given["rate_per_s"]
-    return RampOfCells(ramp, begin + zero, end + zero, start, duration + zero)
+    hold = given["hold_s"] + zero if "hold_s" in given else None
+    return RampOfCells(ramp, begin + zero, end + zero, start, duration + zero, hold)
 
 
 def motions_of(

@@ -5,16 +5,27 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from magpend_core import Status
 from magpend_core.models.model import Model
-from pipeline.analysis.tipping.declaration import TippingOptions
-from pipeline.analysis.tipping.endings import UNKNOWN_END, Final, Group, endings, ends_s, finals_of
+from pipeline.analysis.tipping.declaration import COURSES, TippingOptions
+from pipeline.analysis.tipping.endings import (
+    ELSEWHERE,
+    UNKNOWN_END,
+    Group,
+    compared,
+    drifted,
+    endings,
+    ends_s,
+    finals_of,
+    known_of,
+)
+from pipeline.analysis.tipping.tracking import Cells, courses
 from pipeline.layout.cells import CellMap, initial_states
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     axis_name,
     drift_attributes,
@@ -32,10 +43,6 @@ from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, aligned, counted, header_of, plain, unit_of, words_of
 from pipeline.specification.tables import FREQUENCY
 
-if TYPE_CHECKING:
-    from magpend_core import Sections
-
-
 MOST_VALUES = 40
 """Most values of the swept number that are listed one by one."""
 
@@ -44,7 +51,7 @@ def needs_drift(run: OpenRun, options: TippingOptions) -> None:
     """Raise ValueError unless the run's parameters come to rest before it ends."""
     spec = run.spec
     total = spec.integration.n_transient + spec.integration.n_keep
-    packed, frequency = _cells(run)
+    packed, frequency, _ = _cells(run)
     last = (ends_s(spec, packed, frequency) * frequency).max()
     if last > total * (1.0 + 1e-9):
         raise ValueError(
@@ -63,15 +70,18 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     shape = tuple(cube.sizes[d] for d in order)
     status = cube["status"].transpose(*order).values.ravel()
     last = cube["section"].isel(period_index=-1).transpose(*order, "state").values.reshape(-1, len(model.states))
-    packed, frequency = _cells(run)
+    cells = _cells(run)
     run.echo(f"tipping: going on at the final parameters for {options.settle + options.keep} periods")
-    groups = list(endings(run, finals_of(run.spec, packed, frequency), last, status, options))
+    groups = list(endings(run, finals_of(run.spec, *cells[:2]), last, status, options))
     ids, table = _numbered(groups)
     outcome = np.full(len(status), UNKNOWN_END)
     for group, own in zip(groups, ids, strict=True):
         outcome[group.cells] = [own.get(int(o), int(o)) for o in group.outcome]
     outcome = outcome.reshape(shape)
-    result = xr.Dataset({**table, "outcome": (order, outcome.astype(np.int32))})
+    course = courses(run, cells, groups, options).reshape(shape).astype(np.int8)
+    result = xr.Dataset(
+        {**table, "outcome": (order, outcome.astype(np.int32)), "course": (order, course, code_flags(COURSES))}
+    )
     result = result.assign_coords({k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)})
     axis = parameter_name(options.parameter)
     others = tuple(name for name in run.spec.axes if name != axis)
@@ -84,11 +94,11 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     return result.assign(_of_brackets(brackets, others, model)).assign_attrs(attrs)
 
 
-def _cells(run: OpenRun) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters and frequencies of all cells, in the order of the cube."""
+def _cells(run: OpenRun) -> Cells:
+    """Return all cells in the order of the cube."""
     cells = CellMap(run.spec)
     inputs = cells.inputs(tuple(slice(0, n) for n in cells.shape))
-    return inputs.parameters[:, 0], inputs.frequency_hz[:, 0]
+    return inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states
 
 
 def _numbered(groups: list[Group]) -> tuple[list[dict[int, int]], dict[str, Any]]:
@@ -298,9 +308,7 @@ class Bisection:
         self.run, self.axis, self.others, self.options = run, axis, others, options
         self.starts = initial_states(run.spec.initial_conditions)
         self.width = options.width * float(np.ptp(run.spec.axes[axis].array()))
-        self.known = {
-            group.final.key: (group.final, *_examples(group, own)) for group, own in zip(groups, ids, strict=True)
-        }
+        self.known = known_of(groups, ids)
 
     def run_all(self, brackets: list[Bracket]) -> list[Bracket]:
         """Return the brackets, halved until they are narrow enough or cannot be decided."""
@@ -333,45 +341,8 @@ class Bisection:
             for name, value in here.items():
                 packed[i, names.index(name)] = value
         starts = self.starts.at(np.array([b.start for b in brackets]))
-        found = drifted(self.run, packed, frequency, starts)
+        assert isinstance(spec.motion, Drifting)
+        found = drifted(spec.motion, packed, frequency, starts)
         finals = finals_of(spec, packed, frequency)
-        return self._compared(finals, found.final_state[:, 0], found.status[:, 0])
-
-    def _compared(self, finals: list[Final], states: np.ndarray, status: np.ndarray) -> np.ndarray:
-        """Return the known attractors on which cells end; cells of each known attractor go on beside them."""
-        outcome = np.full(len(finals), UNKNOWN_END)
-        outcome[status == Status.DIVERGED] = DIVERGED
-        keys = [final.key for final in finals]
-        for key in dict.fromkeys(keys):
-            own = np.flatnonzero([k == key for k in keys])
-            if key not in self.known:
-                continue
-            final, examples, labels = self.known[key]
-            n = len(examples)
-            both = np.concatenate([examples, states[own]])
-            codes = np.concatenate([np.full(n, int(Status.BOUNDED)), status[own]])
-            (group,) = endings(self.run, [final] * len(both), both, codes, self.options)
-            names = {int(o): int(label) for o, label in zip(group.outcome[:n], labels, strict=True) if o >= 0}
-            names[DIVERGED] = DIVERGED
-            outcome[own] = [names.get(int(o), UNKNOWN_END) for o in group.outcome[n:]]
-        return outcome
-
-
-def _examples(group: Group, ids: dict[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return states on each attractor of a group, and the attractors' numbers."""
-    most = 3  # cells of each attractor that go on beside those that are examined
-    states, labels = [np.zeros((0, group.settled.shape[1]))], []
-    own = group.outcome[np.searchsorted(group.cells, group.integrated)]
-    for local, number in ids.items():
-        chosen = np.flatnonzero(own == local)[:most]
-        states.append(group.settled[chosen])
-        labels += [number] * len(chosen)
-    return np.concatenate(states), np.array(labels, np.int64)
-
-
-def drifted(run: OpenRun, packed: np.ndarray, frequency_hz: np.ndarray, starts: np.ndarray) -> Sections:
-    """Integrate cells of a run over its whole length, with other parameters; only the last section is kept."""
-    motion, integration = run.spec.motion, run.spec.integration
-    assert isinstance(motion, Drifting)
-    length = {"n_transient": integration.n_transient + integration.n_keep - 1, "n_keep": 1}
-    return motion.sections(packed, frequency_hz, starts, **length, max_orbit_period=1)
+        outcome = compared(self.run, self.known, finals, found.final_state[:, 0], found.status[:, 0], self.options)
+        return np.where(outcome == ELSEWHERE, UNKNOWN_END, outcome)

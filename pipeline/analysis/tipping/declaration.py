@@ -7,6 +7,9 @@ from pipeline.products.product import Analysis, Figure, Options, StateOptions, o
 
 _ROOM = "pipeline.analysis.tipping"
 
+COURSES = ("not_decided", "tracking", "returning", "tipping", "return_tipping")
+"""What becomes of the attractor on which a trajectory begins."""
+
 
 class TippingOptions(Options):
     """Options for finding which attractors are reached after parameters have moved."""
@@ -14,6 +17,7 @@ class TippingOptions(Options):
     parameter: str = option("", "Swept number along which critical values are bisected; by default the only axis.")
     settle: int = option(300, "Integration at the final parameters before attractors are told.", unit="periods", ge=1)
     keep: int = option(64, "Sections kept after that.", ge=16)
+    steps: int = option(64, "Steps in which attractors are continued along the motion of the parameters.", ge=1)
     width: float = option(1e-6, "Width of a critical value's interval, as a part of the axis' range.", gt=0.0, lt=1.0)
     brackets: int = option(64, "Most critical values that are bisected.", ge=0)
 
@@ -41,6 +45,7 @@ class DelayOptions(Options):
 
 TIPPING_COLUMNS: Columns = (
     *over("* +", outcome="attractor reached, -2 diverged, -1 none"),
+    *over("* +", course="whether the trajectory keeps to the attractor on which it begins"),
     *over(
         "attractor",
         attractor_kind="kind of set",
@@ -72,7 +77,9 @@ TIPPING = Analysis(
     """Find which attractor each trajectory reaches after its parameters have moved, and the critical rates.
 
     For runs with a table [drift]. Every trajectory is integrated on at the final parameters, where attractors are found
-    as by `attractors`. Where neighbouring values of the swept number lead to different attractors, it is bisected.""",
+    as by `attractors`. Where neighbouring values of the swept number lead to different attractors, it is bisected.
+    A trajectory tracks, returns or tips: it stays on the attractor on which it begins, leaves it until the parameters
+    come back, or ends on another one.""",
     TippingOptions,
     compute=f"{_ROOM}.analysis:tipping",
     whole="all cells and intervals advance in step",
@@ -81,6 +88,7 @@ TIPPING = Analysis(
     needs=f"{_ROOM}.analysis:needs_drift",
     figure="drift",
     motions=("drifting",),
+    version=2,
 )
 
 OVERLAPS_COLUMNS: Columns = (

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core import Status
-from magpend_core.models.drift.ramps import motions_of
+from magpend_core.models.drift.ramps import RampOfCells, motions_of
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.tipping.declaration import TippingOptions
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute
+from pipeline.motion.drifting import Drifting
 from pipeline.motion.steady import Inputs, Steady
 from pipeline.products.reporting import track
 from pipeline.results.outcomes import DIVERGED, outcomes
@@ -22,10 +23,13 @@ from pipeline.results.ragged import dense
 from pipeline.results.run import OpenRun
 from pipeline.specification.spec import Spec
 
+if TYPE_CHECKING:
+    from magpend_core import Sections
+
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 
-UNKNOWN_END = -1
-"""Outcome of a cell that ends on no known attractor."""
+UNKNOWN_END, ELSEWHERE = -1, -3
+"""Outcomes of a trajectory that is not decided, and of one that ends on an attractor that no cell reaches."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,16 @@ class Final:
 
 def finals_of(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> list[Final]:
     """Return the final parameters of cells of a run, from their own (cell, n_parameters) and their frequencies."""
+    return held_at(spec, packed, frequency_hz, motions_of(spec.ramps, spec.values.names, packed, frequency_hz))
+
+
+def held_at(
+    spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray, motions: Sequence[RampOfCells], value: str = "final"
+) -> list[Final]:
+    """Return the constant parameters of cells whose moving parameters are held at a value of their motions."""
     still: Model = spec.model.still  # type: ignore[attr-defined]
-    ends = {m.ramp.parameter: m.end for m in motions_of(spec.ramps, spec.values.names, packed, frequency_hz)}
-    own = dict(zip(spec.values.names, packed.T, strict=True)) | ends
+    own = dict(zip(spec.values.names, packed.T, strict=True))
+    own |= {motion.ramp.parameter: getattr(motion, value) for motion in motions}
     rows = np.column_stack([*(own[name] for name in still.parameter_names), frequency_hz])
     distinct, which = np.unique(rows, axis=0, return_inverse=True)
     values = [(dict(zip(still.parameter_names, row, strict=False)), row[-1]) for row in distinct.tolist()]
@@ -110,3 +121,56 @@ def _going_on(run: OpenRun, final: Final, states: np.ndarray, options: TippingOp
     units = ("state", list(model.state_units))
     coords = {"state": list(model.state_names), "state_units": units, FREQUENCY_DIM: final.frequency_hz}
     return xr.Dataset(data, coords=coords, attrs=attrs)
+
+
+Known = Mapping[bytes, tuple[Final, np.ndarray, np.ndarray]]
+"""By the key of the final parameters: these, states on attractors there (n, n_states), and the attractors' numbers."""
+
+
+def known_of(groups: Sequence[Group], ids: Sequence[Mapping[int, int]]) -> Known:
+    """Return what groups tell of attractors, which have the numbers `ids` in each group."""
+    return {group.final.key: (group.final, *_examples(group, own)) for group, own in zip(groups, ids, strict=True)}
+
+
+def _examples(group: Group, ids: Mapping[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return states on each attractor of a group, and the attractors' numbers."""
+    most = 3  # cells of each attractor that go on beside those that are examined
+    states, labels = [np.zeros((0, group.settled.shape[1]))], []
+    own = group.outcome[np.searchsorted(group.cells, group.integrated)]
+    for local, number in ids.items():
+        chosen = np.flatnonzero(own == local)[:most]
+        states.append(group.settled[chosen])
+        labels += [number] * len(chosen)
+    return np.concatenate(states), np.array(labels, np.int64)
+
+
+def compared(
+    run: OpenRun, known: Known, finals: Sequence[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
+) -> np.ndarray:
+    """Return the numbers of the known attractors on which cells end; states on these go on beside the cells.
+
+    `DIVERGED`, `ELSEWHERE` or `UNKNOWN_END` for others. Finals, states and codes of `Status` are those of the cells.
+    """
+    outcome = np.full(len(finals), UNKNOWN_END)
+    outcome[status == Status.DIVERGED] = DIVERGED
+    keys = [final.key for final in finals]
+    for key in dict.fromkeys(keys):
+        own = np.flatnonzero([k == key for k in keys])
+        if key not in known:
+            continue
+        final, examples, labels = known[key]
+        n = len(examples)
+        both = np.concatenate([examples, states[own]])
+        codes = np.concatenate([np.full(n, int(Status.BOUNDED)), status[own]])
+        (group,) = endings(run, [final] * len(both), both, codes, options)
+        names = {int(o): int(label) for o, label in zip(group.outcome[:n], labels, strict=True) if o >= 0}
+        names |= {DIVERGED: DIVERGED, UNKNOWN_END: UNKNOWN_END}
+        outcome[own] = [names.get(int(o), ELSEWHERE) for o in group.outcome[n:]]
+    return outcome
+
+
+def drifted(motion: Drifting, packed: np.ndarray, frequency_hz: np.ndarray, starts: np.ndarray) -> Sections:
+    """Integrate cells over the whole length of a run whose parameters move; only the last section is kept."""
+    integration = motion.integration
+    length = {"n_transient": integration.n_transient + integration.n_keep - 1, "n_keep": 1}
+    return motion.sections(packed, frequency_hz, starts, **length, max_orbit_period=1)

@@ -150,6 +150,44 @@ def test_drifting_sections__of_two_parameters_and_a_table():
     np.testing.assert_allclose(found.section[0, 0], expected, atol=3e-9)
 
 
+@pytest.mark.parametrize("shape", ["linear", "tanh"])
+def test_motion__goes_there_and_back(shape):
+    numbers = {"from": 0.5, "to": 2.0, "start_s": 7.3, "duration_s": 11.7, "hold_periods": 1.5}
+    ramp = Ramp("A", shape, tuple(numbers.items()))
+    packed = np.array([[1.0, 0.1, 1.0, *numbers.values()]])
+    (motion,) = motions_of([ramp], ("k", "d", "A", *ramp.names), packed, np.array([HZ]))
+    assert (motion.end[0], motion.final[0], motion.end_s[0]) == (2.0, 0.5, pytest.approx(7.3 + 2 * 11.7 + 5.0))
+    t = np.linspace(0.0, 50.0, 401)
+    one_way, mirrored = (value(at, 0.5, 2.0, 7.3, 11.7, shape == "tanh") for at in (t, 43.0 - t))
+    np.testing.assert_allclose(motion.at(0, t), np.minimum(one_way, mirrored), atol=1e-12)
+    assert motion.at(0, np.array([99.0]))[0] == 0.5
+    corners = [7.3, 13.15, 19.0, 24.0, 29.85, 35.7]
+    np.testing.assert_allclose(np.unique(motion.corners(0, 2).round(9)), corners)
+    (out,) = motions_of([ramp.way_out], ("k", "d", "A", *ramp.names), packed, np.array([HZ]))
+    assert (out.final[0], out.end_s[0]) == (2.0, 19.0)
+
+
+def test_way_out__of_a_table_ends_at_its_farthest_value():
+    out = Ramp("A", TABLE, (), (0.0, 1.0, 2.0, 5.0), (1.0, 1.5, -1.0, 1.0)).way_out
+    assert (out.times_s, out.values) == ((0.0, 1.0, 2.0), (1.0, 1.5, -1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", [0.0, 5.3])
+@pytest.mark.parametrize("shape", ["linear", "tanh"])
+def test_drifting_sections__there_and_back_against_another_integrator(shape, hold):
+    ramp = Ramp("k", shape, (("from", 0.5), ("to", 2.0), ("start_s", 7.3), ("duration_s", 11.7), ("hold_s", hold)))
+    _, found = drifted(OSCILLATOR, [ramp], [{}])
+
+    def rhs(t, y):
+        there = [value(at, 0.5, 2.0, 7.3, 11.7, shape == "tanh") for at in (t, 2 * 19.0 + hold - t)]
+        return [y[1], 0.5 * np.cos(2 * np.pi * HZ * t) - 0.1 * y[1] - min(there) * y[0]]
+
+    marks = list(np.arange(1, 21) / HZ)
+    expected = by_scipy(rhs, marks, START, (7.3, 19.0, 19.0 + hold, 30.7 + hold), 1e-12)
+    np.testing.assert_allclose(found.section[0, 0], expected, atol=3e-9)
+
+
 @pytest.mark.slow
 def test_drifting_sections__of_a_switched_drive():
     """True jumps of the drive and of friction: corners lie between the edges of a period, and on one of them."""

@@ -126,7 +126,7 @@ def test_brackets__stay_at_their_values_of_other_axes() -> None:
 
 def test_finals_of__all_rates_end_at_one_value() -> None:
     run = run_of()
-    packed, frequency = _cells(run)
+    packed, frequency, _ = _cells(run)
     finals = finals_of(run.spec, packed, frequency)
     assert len(finals) == 8
     assert len({final.key for final in finals}) == 1
@@ -139,7 +139,7 @@ def test_finals_of__all_rates_end_at_one_value() -> None:
 def test_finals_of__different_ends_are_different_points() -> None:
     drift = {"l": {"rate_per_s": 1.0, "start_s": 3.0}}
     run = run_of(drift=drift, axes={"l_to": {"values": [5.0, 10.0]}})
-    packed, frequency = _cells(run)
+    packed, frequency, _ = _cells(run)
     finals = finals_of(run.spec, packed, frequency)
     assert [final.parameters["l"] for final in finals] == [5.0, 5.0, 10.0, 10.0]
     assert len({final.key for final in finals}) == 2
