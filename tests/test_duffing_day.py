@@ -115,7 +115,7 @@ ANALYSES = {
     "curves": "walk --second amplitude --second-from 0.25 --second-to 0.35",
     "orbits": f"sweep {POINT} --period 1 --starts 40",
     "resilience": f"sweep {LINE} --directions 8 --confirmations 8 --phases 2 --timed 8",
-    "tipping": "ramp --settle 60 --width 0.1",
+    "tipping": "ramp --settle 60 --interval 0.1",
     "delay": "ramp",
     "overlaps": f"sweep {LINE} --parameter frequency --from 0.155 --to 0.159154943",
     "escapes": "noisy --high x=0.5",

@@ -95,7 +95,7 @@ _OWN: dict[str, dict[str, Line]] = {
         "tangency": Line(_room("manifolds"), f"{_POINT}, and two states"),
     },
     "Moving parameters": {
-        "tipping": Line(_room("tipping"), _DRIFT),
+        "tipping": Line(_room("tipping"), _DRIFT, f"{_DRIFT}, and {_ONE}, or {_TWO}"),
         "delay": Line(_room("tipping"), _DRIFT),
         "drift": Line(_room("tipping"), None, _DRIFT),
     },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -23,7 +24,7 @@ from pipeline.analysis.tipping.endings import (
     finals_of,
     known_of,
 )
-from pipeline.analysis.tipping.tracking import Cells, courses
+from pipeline.analysis.tipping.tracking import UNDECIDED, Cells, courses
 from pipeline.layout.cells import CellMap, initial_states
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
@@ -43,8 +44,7 @@ from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, aligned, counted, header_of, plain, unit_of, words_of
 from pipeline.specification.tables import FREQUENCY
 
-MOST_VALUES = 40
-"""Most values of the swept number that are listed one by one."""
+NOT_DECIDED = plain(COURSES[UNDECIDED])
 
 
 def needs_drift(run: OpenRun, options: TippingOptions) -> None:
@@ -168,15 +168,17 @@ def _of_brackets(brackets: list[Bracket], others: tuple[str, ...], model: Model)
 
 def outcome_word(outcome: int) -> str:
     """Return the name of an outcome: a letter, diverged, or not decided."""
-    return {DIVERGED: "diverged", UNKNOWN_END: "not decided"}.get(outcome) or letter(outcome)
+    return {DIVERGED: "diverged", UNKNOWN_END: NOT_DECIDED}.get(outcome) or letter(outcome)
 
 
 def tipping_table(ds: xr.Dataset) -> Table:
     """Return a row per critical value; the lines also list the attractors and the cells that reach them."""
     rows = [_row(ds.isel(critical=i)) for i in range(ds.sizes["critical"])]
-    lines = ["attractors reached at the final parameters", *aligned(_attractors(ds)), *_counts(ds)]
     axis = str(ds.attrs["parameter"])
     dim = axis_name(axis)
+    lines = ["attractors reached at the final parameters", *aligned(_attractors(ds))]
+    lines += _counts(ds["outcome"], dim, outcome_word, "cells on each")
+    lines += _counts(ds["course"], dim, lambda k: plain(COURSES[k]), "cells by what becomes of their first attractor")
     unit = unit_of(ds, dim) if dim in ds.coords else ""
     n, shown = int(ds.attrs["n_brackets"]), len(rows)
     lines.append(f"{counted(n, 'critical value')} of {axis}" if n else "no cell changes its attractor along the sweep")
@@ -229,19 +231,16 @@ def _attractors(ds: xr.Dataset) -> list[dict[str, str | None]]:
     ]
 
 
-def _counts(ds: xr.Dataset) -> list[str]:
-    """Return the lines with the numbers of cells on each attractor, per value of the swept number."""
-    dim = axis_name(str(ds.attrs["parameter"]))
-    outcome = ds["outcome"]
-    seen = sorted({int(o) for o in np.unique(outcome.values)}, key=lambda o: (o < 0, o))
-    if dim not in outcome.dims:
-        counts = ", ".join(f"{outcome_word(o)} {int((outcome == o).sum())}" for o in seen)
-        return [f"cells: {counts}"]
+def _counts(cells: xr.DataArray, dim: str, word: Callable[[int], str], title: str) -> list[str]:
+    """Return the lines with the numbers of cells with each code, per value of a swept number."""
+    seen = sorted({int(o) for o in np.unique(cells.values)}, key=lambda o: (word(o) == NOT_DECIDED, o < 0, o))
+    if dim not in cells.dims:
+        return [f"{title}: {', '.join(f'{word(o)} {int((cells == o).sum())}' for o in seen)}"]
     rows: list[dict[str, Any]] = []
-    for i, value in enumerate(ds[dim].values):
-        here = outcome.isel({dim: i}).values
-        found = {outcome_word(o): str(int((here == o).sum())) for o in seen}
-        if rows and [rows[-1][word] for word in found] == list(found.values()):
+    for i, value in enumerate(cells[dim].values):
+        here = cells.isel({dim: i}).values
+        found = {word(o): str(int((here == o).sum())) for o in seen}
+        if rows and [rows[-1][name] for name in found] == list(found.values()):
             rows[-1]["to"] = value
             continue
         rows.append({"from": value, **found, "to": value})
@@ -249,8 +248,8 @@ def _counts(ds: xr.Dataset) -> list[str]:
     for row in rows:
         first, last = row.pop("from"), row.pop("to")
         text = f"{first:g}" if first == last else f"{first:g} to {last:g}"
-        words.append({f"{dim}{unit_of(ds, dim)}": text, **row})
-    return ["cells on each", *aligned(words)]
+        words.append({f"{dim}{unit_of(cells.to_dataset(name='cells'), dim)}": text, **row})
+    return [title, *aligned(words)]
 
 
 @dataclass(frozen=True)
@@ -307,7 +306,7 @@ class Bisection:
     ) -> None:
         self.run, self.axis, self.others, self.options = run, axis, others, options
         self.starts = initial_states(run.spec.initial_conditions)
-        self.width = options.width * float(np.ptp(run.spec.axes[axis].array()))
+        self.width = options.interval * float(np.ptp(run.spec.axes[axis].array()))
         self.known = known_of(groups, ids)
 
     def run_all(self, brackets: list[Bracket]) -> list[Bracket]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.products.column import STATES, Columns, over
-from pipeline.products.product import Analysis, Figure, Options, StateOptions, option
+from pipeline.products.product import Analysis, Figure, FigureOptions, Options, StateOptions, option
 
 _ROOM = "pipeline.analysis.tipping"
 
@@ -18,7 +18,9 @@ class TippingOptions(Options):
     settle: int = option(300, "Integration at the final parameters before attractors are told.", unit="periods", ge=1)
     keep: int = option(64, "Sections kept after that.", ge=16)
     steps: int = option(64, "Steps in which attractors are continued along the motion of the parameters.", ge=1)
-    width: float = option(1e-6, "Width of a critical value's interval, as a part of the axis' range.", gt=0.0, lt=1.0)
+    interval: float = option(
+        1e-6, "Width of a critical value's interval, as a part of the axis' range.", gt=0.0, lt=1.0
+    )
     brackets: int = option(64, "Most critical values that are bisected.", ge=0)
 
 
@@ -86,9 +88,27 @@ TIPPING = Analysis(
     columns=TIPPING_COLUMNS,
     table=f"{_ROOM}.analysis:tipping_table",
     needs=f"{_ROOM}.analysis:needs_drift",
-    figure="drift",
+    figure="tipping",
     motions=("drifting",),
     version=2,
+)
+
+
+class TippingFigureOptions(TippingOptions, FigureOptions):
+    """Options of a diagram of tracking, returning and tipping."""
+
+    condition: int = option(0, "Number of the initial condition of a map; bands over one swept number show all.", ge=0)
+
+
+TIPPING_FIGURE = Figure(
+    "tipping",
+    """Draw which trajectories track, return and tip: a map over two swept numbers, or bands over one.
+
+    The horizontal axis is the number along which critical values are bisected, which are dots.""",
+    TippingFigureOptions,
+    f"{_ROOM}.diagram:draw_tipping",
+    needs=f"{_ROOM}.analysis:needs_drift",
+    motions=("drifting",),
 )
 
 OVERLAPS_COLUMNS: Columns = (

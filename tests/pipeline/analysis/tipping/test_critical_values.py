@@ -77,7 +77,7 @@ class ByRule(Bisection):
 
 
 def test_bisection__finds_the_square_root_of_two() -> None:
-    bisection = ByRule(lambda b: 0 if b.middle**2 < 2.0 else 1, TippingOptions(width=1e-9))
+    bisection = ByRule(lambda b: 0 if b.middle**2 < 2.0 else 1, TippingOptions(interval=1e-9))
     (found,) = bisection.run_all([Bracket(0, (), 1.0, 2.0, 0, 1)])
     # the width is a part of the axis' range, from .9 to 1.3
     assert found.high - found.low <= 4e-10
@@ -91,7 +91,7 @@ def test_bisection__ends_each_bracket_by_itself() -> None:
         return UNKNOWN_END if bracket.start == 1 else int(bracket.middle > 1.25)
 
     brackets = [Bracket(k, (), 1.0, 2.0, 0, 1) for k in range(3)]
-    found = ByRule(rule, TippingOptions(width=0.01)).run_all(brackets)
+    found = ByRule(rule, TippingOptions(interval=0.01)).run_all(brackets)
     assert [b.is_decided for b in found] == [True, False, True]
     assert [b.n_evaluated for b in found] == [8, 1, 8]
     assert found[0].low <= 1.25 <= found[0].high
@@ -100,7 +100,7 @@ def test_bisection__ends_each_bracket_by_itself() -> None:
 def test_bisection__stops_at_neighbouring_numbers() -> None:
     low = 1.0
     high = np.nextafter(low, 2.0)
-    (found,) = ByRule(lambda b: 0, TippingOptions(width=1e-300)).run_all([Bracket(0, (), low, high, 0, 1)])
+    (found,) = ByRule(lambda b: 0, TippingOptions(interval=1e-300)).run_all([Bracket(0, (), low, high, 0, 1)])
     assert (found.low, found.high, found.n_evaluated) == (low, high, 0)
 
 
@@ -195,7 +195,9 @@ def test_numbered__attractors_of_all_groups_that_have_cells(numbered) -> None:
 def test_tipping_table__names_outcomes_and_counts_cells(numbered) -> None:
     outcome = xr.DataArray([[1, 0, 1], [2, DIVERGED, UNKNOWN_END]], dims=("a", "initial_condition"))
     brackets = [Bracket(1, (), 1.25, 1.250002, 0, DIVERGED, 19), Bracket(2, (), 1.0, 2.0, 1, 2, 1, is_decided=False)]
-    ds = numbered[1].assign(outcome=outcome, **_of_brackets(brackets, (), load_model("duffing")))
+    ds = numbered[1].assign(
+        outcome=outcome, course=xr.zeros_like(outcome), **_of_brackets(brackets, (), load_model("duffing"))
+    )
     ds = ds.assign_coords(a=("a", [1.0, 2.0], {"units": "N"})).assign_attrs(parameter="a", n_brackets=3)
     table = tipping_table(ds)
     assert [(row["from"], row["to"], row["decided"]) for row in table.rows] == [
@@ -215,7 +217,9 @@ def test_tipping_table__names_outcomes_and_counts_cells(numbered) -> None:
 def test_tipping_table__joins_values_with_equal_counts() -> None:
     _, table = _numbered([group_of(1.0, [0, 1, 2, 3], [0, 0, 0, 0], [-1.0])])
     outcome = xr.DataArray([[0], [0], [0], [DIVERGED]], dims=("rate", "initial_condition"))
-    ds = xr.Dataset(table).assign(outcome=outcome, **_of_brackets([], (), load_model("duffing")))
+    ds = xr.Dataset(table).assign(
+        outcome=outcome, course=xr.ones_like(outcome), **_of_brackets([], (), load_model("duffing"))
+    )
     ds = ds.assign_coords(rate=[0.1, 0.2, 0.3, 0.4]).assign_attrs(parameter="rate", n_brackets=0)
     lines = tipping_table(ds).lines
     assert any(line.split() == ["0.1", "to", "0.3", "1", "0"] for line in lines)
