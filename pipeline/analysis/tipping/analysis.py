@@ -12,19 +12,10 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model
+from pipeline.analysis.attractors.destinations import ELSEWHERE
 from pipeline.analysis.tipping.declaration import COURSES, TippingOptions
-from pipeline.analysis.tipping.endings import (
-    ELSEWHERE,
-    UNKNOWN_END,
-    Group,
-    compared,
-    drifted,
-    endings,
-    ends_s,
-    finals_of,
-    known_of,
-)
-from pipeline.analysis.tipping.tracking import UNDECIDED, Cells, courses
+from pipeline.analysis.tipping.endings import UNKNOWN_END, Group, Known, compared, drifted, endings, ends_s, finals_of
+from pipeline.analysis.tipping.tracking import UNDECIDED_COURSE, Cells, Ends, courses
 from pipeline.layout.cells import CellMap, initial_states
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
@@ -44,7 +35,7 @@ from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, aligned, counted, header_of, plain, unit_of, words_of
 from pipeline.specification.tables import FREQUENCY
 
-NOT_DECIDED = plain(COURSES[UNDECIDED])
+NOT_DECIDED = plain(COURSES[UNDECIDED_COURSE])
 
 
 def needs_drift(run: OpenRun, options: TippingOptions) -> None:
@@ -73,14 +64,15 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     cells = _cells(run)
     run.echo(f"tipping: going on at the final parameters for {options.settle + options.keep} periods")
     groups = list(endings(run, finals_of(run.spec, *cells[:2]), last, status, options))
-    ids, table = _numbered(groups)
-    outcome = np.full(len(status), UNKNOWN_END)
-    for group, own in zip(groups, ids, strict=True):
-        outcome[group.cells] = [own.get(int(o), int(o)) for o in group.outcome]
-    outcome = outcome.reshape(shape)
-    course = courses(run, cells, groups, options).reshape(shape).astype(np.int8)
+    reached = Ends.of(groups)
+    outcome = reached.outcome.reshape(shape)
+    course = courses(run, cells, reached, options).reshape(shape).astype(np.int8)
     result = xr.Dataset(
-        {**table, "outcome": (order, outcome.astype(np.int32)), "course": (order, course, code_flags(COURSES))}
+        {
+            **_attractors_of(groups),
+            "outcome": (order, outcome.astype(np.int32)),
+            "course": (order, course, code_flags(COURSES)),
+        }
     )
     result = result.assign_coords({k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)})
     axis = parameter_name(options.parameter)
@@ -89,7 +81,7 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     whole: list[Bracket] = []
     if axis in run.spec.axes and len(run.spec.axes[axis].array()) > 1:
         whole = _brackets(run, axis, others, outcome, dims)
-        brackets = Bisection(run, axis, others, groups, ids, options).run_all(whole[: options.brackets])
+        brackets = Bisection(run, axis, others, reached.known, options).run_all(whole[: options.brackets])
     attrs = {"model": model_attribute(model), **drift_attributes(model), "parameter": axis, "n_brackets": len(whole)}
     return result.assign(_of_brackets(brackets, others, model)).assign_attrs(attrs)
 
@@ -101,20 +93,17 @@ def _cells(run: OpenRun) -> Cells:
     return inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states
 
 
-def _numbered(groups: list[Group]) -> tuple[list[dict[int, int]], dict[str, Any]]:
-    """Number the attractors of all groups, and return the numbers by group with a table of the attractors."""
-    ids: list[dict[int, int]] = []
+def _attractors_of(groups: list[Group]) -> dict[str, Any]:
+    """Return a table of the attractors of all groups, in the order of their numbers (see `Ends`)."""
     rows: list[tuple[int, int, xr.Dataset]] = []
     for number, group in enumerate(groups):
-        ids.append({})
         for local in sorted({int(o) for o in group.outcome if o >= 0}):
             assert group.ids is not None
-            ids[-1][local] = len(rows)
             rows.append((number, int((group.outcome == local).sum()), group.ids.isel(attractor=local)))
     kinds = [words_of(one["kind"])[int(one["kind"])] for *_, one in rows]
     points = [one["attractor_points"].values[0] for *_, one in rows]
     n_states = len(groups[0].final.parameters.model.state_names)
-    return ids, {
+    return {
         "attractor_kind": ("attractor", np.array(kinds, dtype="U32")),
         "attractor_period": ("attractor", np.array([int(one["orbit_period"]) for *_, one in rows], np.int32)),
         "attractor_group": ("attractor", np.array([number for number, *_ in rows], np.int32)),
@@ -291,23 +280,14 @@ def brackets_of(outcomes: np.ndarray) -> list[tuple[int, int]]:
 class Bisection:
     """A bisection of many brackets of a run's swept number at the same time.
 
-    The others are the names of the other swept parameters, in the order of `Bracket.point`. Groups tell what is known
-    of the run's own cells (see `endings`), and ids the numbers that the attractors of each have in the brackets.
+    The others are the names of the other swept parameters, in the order of `Bracket.point`. The known attractors are
+    those that the run's own cells reach.
     """
 
-    def __init__(
-        self,
-        run: OpenRun,
-        axis: str,
-        others: tuple[str, ...],
-        groups: list[Group],
-        ids: list[dict[int, int]],
-        options: TippingOptions,
-    ) -> None:
-        self.run, self.axis, self.others, self.options = run, axis, others, options
+    def __init__(self, run: OpenRun, axis: str, others: tuple[str, ...], known: Known, options: TippingOptions) -> None:
+        self.run, self.axis, self.others, self.known, self.options = run, axis, others, known, options
         self.starts = initial_states(run.spec.initial_conditions)
         self.width = options.interval * float(np.ptp(run.spec.axes[axis].array()))
-        self.known = known_of(groups, ids)
 
     def run_all(self, brackets: list[Bracket]) -> list[Bracket]:
         """Return the brackets, halved until they are narrow enough or cannot be decided."""

@@ -13,6 +13,7 @@ from magpend_core import Status
 from magpend_core.models.drift.ramps import RampOfCells, motions_of
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.attractors.destinations import ELSEWHERE
 from pipeline.analysis.tipping.declaration import TippingOptions
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute
 from pipeline.motion.drifting import Drifting
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 
-UNKNOWN_END, ELSEWHERE = -1, -3
-"""Outcomes of a trajectory that is not decided, and of one that ends on an attractor that no cell reaches."""
+UNKNOWN_END = -1
+"""Outcome of a cell that ends on no known attractor."""
 
 
 @dataclass(frozen=True)

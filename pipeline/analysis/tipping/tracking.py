@@ -16,9 +16,9 @@ import numpy as np
 from magpend_core import Status
 from magpend_core.models.drift.ramps import RampOfCells, motions_of
 from magpend_core.models.model import Model, Parameters
+from pipeline.analysis.attractors.destinations import ELSEWHERE
 from pipeline.analysis.tipping.declaration import COURSES, TippingOptions
 from pipeline.analysis.tipping.endings import (
-    ELSEWHERE,
     GOOD,
     UNKNOWN_END,
     Final,
@@ -40,7 +40,7 @@ from pipeline.results.tolerances import CELL_CLOSURE
 Cells = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Packed parameters (cell, parameter), frequencies (cell,) and initial states (cell, state) of a run's cells."""
 
-UNDECIDED, TRACKING, RETURNING, TIPPING, RETURN_TIPPING = range(len(COURSES))
+UNDECIDED_COURSE, TRACKING, RETURNING, TIPPING, RETURN_TIPPING = range(len(COURSES))
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Path:
     parameters: np.ndarray  # (step, parameter): from the first ones to those of the target
 
 
-def courses(run: OpenRun, cells: Cells, groups: Sequence[Group], options: TippingOptions) -> np.ndarray:
-    """Return for each cell the number of its course in `COURSES`; groups tell where the cells end."""
+def courses(run: OpenRun, cells: Cells, reached: Ends, options: TippingOptions) -> np.ndarray:
+    """Return for each cell the number of its course in `COURSES`, from the attractors that the cells have reached."""
     packed, frequency_hz, starts = cells
     spec, motion = run.spec, run.spec.motion
     assert isinstance(motion, Drifting)
@@ -84,7 +84,7 @@ def courses(run: OpenRun, cells: Cells, groups: Sequence[Group], options: Tippin
     run.echo("tipping: the attractors at the first parameters")
     origins = _origins(run, begins, starts, options)
     ends = held_at(spec, packed, frequency_hz, motions)
-    stays = _stays(run, _paths(motions, begins, ends, origins, options), origins, Ends.of(groups), options)
+    stays = _stays(run, _paths(motions, begins, ends, origins, options), origins, reached, options)
     out = tuple(ramp.way_out for ramp in spec.ramps)
     if out == spec.ramps:
         return course_of(stays, stays)
@@ -102,7 +102,7 @@ def course_of(stays: np.ndarray, away: np.ndarray) -> np.ndarray:
 
     `away` tells the same of the motion without the way back.
     """
-    course = np.full(len(stays), UNDECIDED)
+    course = np.full(len(stays), UNDECIDED_COURSE)
     course[(stays == 1) & (away == 1)] = TRACKING
     course[(stays == 1) & (away == 0)] = RETURNING
     course[stays == 0] = TIPPING

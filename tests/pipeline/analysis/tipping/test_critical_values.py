@@ -12,9 +12,9 @@ from magpend_core.models import load_model
 from pipeline.analysis.tipping.analysis import (
     Bisection,
     Bracket,
+    _attractors_of,
     _brackets,
     _cells,
-    _numbered,
     _of_brackets,
     brackets_of,
     needs_drift,
@@ -69,7 +69,7 @@ class ByRule(Bisection):
     """A bisection whose trajectories follow a rule instead of the engine."""
 
     def __init__(self, rule, options: TippingOptions) -> None:
-        super().__init__(run_of(), "l_rate_per_s", (), [], [], options)
+        super().__init__(run_of(), "l_rate_per_s", (), {}, options)
         self.rule = rule
 
     def _outcomes(self, brackets: list[Bracket]) -> np.ndarray:
@@ -171,19 +171,17 @@ def group_of(a: float, cells: list[int], outcome: list[int], points: list[float]
 
 
 @pytest.fixture
-def numbered() -> tuple[list[dict[int, int]], xr.Dataset]:
-    """Return the numbers and the table of attractors of two groups; of the first group an attractor has no cell."""
+def attractors() -> xr.Dataset:
+    """Return the table of attractors of two groups; of the first group an attractor has no cell."""
     groups = [
         group_of(1.0, [0, 1, 2], [2, 0, 2], [-1.0, 0.5, 1.0]),
         group_of(2.0, [3, 4, 5], [0, DIVERGED, UNKNOWN_END], [3.0]),
     ]
-    ids, table = _numbered(groups)
-    return ids, xr.Dataset(table)
+    return xr.Dataset(_attractors_of(groups))
 
 
-def test_numbered__attractors_of_all_groups_that_have_cells(numbered) -> None:
-    ids, table = numbered
-    assert ids == [{0: 0, 2: 1}, {0: 2}]
+def test_attractors__of_all_groups_that_have_cells(attractors) -> None:
+    table = attractors
     assert table["attractor_point"].values.tolist() == [[-1.0], [1.0], [3.0]]
     assert table["attractor_n_cells"].values.tolist() == [1, 2, 1]
     assert table["attractor_group"].values.tolist() == [0, 0, 1]
@@ -192,10 +190,10 @@ def test_numbered__attractors_of_all_groups_that_have_cells(numbered) -> None:
     assert table["final_parameters"].values.tolist() == ["a = 1", "a = 2"]
 
 
-def test_tipping_table__names_outcomes_and_counts_cells(numbered) -> None:
+def test_tipping_table__names_outcomes_and_counts_cells(attractors) -> None:
     outcome = xr.DataArray([[1, 0, 1], [2, DIVERGED, UNKNOWN_END]], dims=("a", "initial_condition"))
     brackets = [Bracket(1, (), 1.25, 1.250002, 0, DIVERGED, 19), Bracket(2, (), 1.0, 2.0, 1, 2, 1, is_decided=False)]
-    ds = numbered[1].assign(
+    ds = attractors.assign(
         outcome=outcome, course=xr.zeros_like(outcome), **_of_brackets(brackets, (), load_model("duffing"))
     )
     ds = ds.assign_coords(a=("a", [1.0, 2.0], {"units": "N"})).assign_attrs(parameter="a", n_brackets=3)
@@ -215,7 +213,7 @@ def test_tipping_table__names_outcomes_and_counts_cells(numbered) -> None:
 
 
 def test_tipping_table__joins_values_with_equal_counts() -> None:
-    _, table = _numbered([group_of(1.0, [0, 1, 2, 3], [0, 0, 0, 0], [-1.0])])
+    table = _attractors_of([group_of(1.0, [0, 1, 2, 3], [0, 0, 0, 0], [-1.0])])
     outcome = xr.DataArray([[0], [0], [0], [DIVERGED]], dims=("rate", "initial_condition"))
     ds = xr.Dataset(table).assign(
         outcome=outcome, course=xr.ones_like(outcome), **_of_brackets([], (), load_model("duffing"))
