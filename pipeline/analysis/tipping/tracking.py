@@ -201,7 +201,7 @@ def _continued(
     closed = (found.status[:, :steps] == Status.PERIODIC) & (found.status[:, :steps:-1] == Status.PERIODIC)
     with np.errstate(invalid="ignore"):
         near = Geometry.of(model).distance(back, last[:, :, None]).min(axis=-1) <= CELL_CLOSURE
-    good = np.isin(found.status, GOOD).all(axis=1)
+    good = np.asarray(np.isin(found.status, GOOD).all(axis=1))
     code = np.where(good, 0, np.where((found.status == Status.DIVERGED).any(axis=1), ELSEWHERE, UNKNOWN_END))
     which, step = np.nonzero(good[:, None] & ~(closed & near))
     if len(which):
