@@ -95,9 +95,9 @@ _OWN: dict[str, dict[str, Line]] = {
         "tangency": Line(_room("manifolds"), f"{_POINT}, and two states"),
     },
     "Moving parameters": {
+        "drift": Line(_room("tipping"), None, _DRIFT),
         "tipping": Line(_room("tipping"), _DRIFT, f"{_DRIFT}, and {_ONE}, or {_TWO}"),
         "delay": Line(_room("tipping"), _DRIFT),
-        "drift": Line(_room("tipping"), None, _DRIFT),
     },
     "Noise": {"escapes": Line(_room("noise"), _NOISE, _NOISE), "density": Line(_room("noise"), _NOISE, _NOISE)},
 }

@@ -85,7 +85,7 @@ class Figures:
     rotation = OnePanel(of_product.FigureOptions)
     tongues = OnePanel(of_branches.TongueFigureOptions)
     manifolds = OnePanel(of_manifolds.ManifoldFigureOptions)
-    tipping = OnePanel(of_tipping.TippingFigureOptions)
     drift = OnePanel(of_tipping.DriftFigureOptions)
+    tipping = OnePanel(of_tipping.TippingFigureOptions)
     escapes = AnyPanels(of_noise.EscapeFigureOptions)
     density = AnyPanels(of_noise.DensityFigureOptions)
