@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magpend_core.models import load_model
+from magpend_core.models.sectioned import SectionedModel
 from magpend_core.models.text.definition import OMEGA
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of
@@ -35,7 +36,8 @@ PERIODIC, TWICE = 1e-6, 2
 def check_starts(spec: Spec) -> None:
     """Refuse a run of a model written as text if its equations cannot be evaluated at the initial conditions.
 
-    They must also have the drive's period in time, in most of some drawn states at the ends of every axis.
+    They must also have the drive's period in time, in most of some drawn states at the ends of every axis; and what
+    crosses the level of a section must change along the motion at one end at least.
 
     They are evaluated at time 0 at all starts (at most `MOST_STARTS`), at both ends of every axis. If they
     have values at some of the ends, the run is not refused: the status of its cells shows where they have
@@ -54,6 +56,8 @@ def check_starts(spec: Spec) -> None:
     check_states(model, states.at(chosen), points)
     if isinstance(model, TextModel) and model.clock.has_drive and spec.drive is None:
         _check_period(model, states.at(chosen[: len(SHARES)]), points)
+    if isinstance(spec.model, SectionedModel):
+        _check_section(spec.model, points)
 
 
 def parameter_points(spec: Spec) -> list[dict[str, Any]]:
@@ -83,6 +87,18 @@ def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping
                 )
     if problems:
         raise SpecError(list(problems.values()))
+
+
+def _check_section(model: SectionedModel, points: Sequence[Mapping[str, Any]]) -> None:
+    """Raise `SpecError` for a section of an expression that the motion keeps at all points."""
+    text = model.expressed
+    if not isinstance(text, TextModel) or text.definition.surface is None:
+        return
+    from magpend_core.models.text.surfaces import tangent_problem
+
+    problems = [tangent_problem(text, {name: float(p[name]) for name in text.parameter_names}) for p in points]
+    if all(problems):
+        raise SpecError(f"section.of = {model.through.of!r}: at the run's parameters it {problems[0]}")
 
 
 def _hiding(model: TextModel, name: str) -> str:

@@ -191,7 +191,8 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
     seconds = time.process_time() - started
     ends = values["section"][:, -1, -1]
     a_period = spec.motion.seconds_per_period(inputs.frequency_hz)
-    by_rule = float((a_period * values["n_periods"]).sum())
+    # a flow that does not return waits for as long as it may
+    by_rule = float((a_period * np.maximum(values["n_periods"], 1)).sum())
     return np.where(np.isfinite(ends), ends, inputs.initial_states), seconds / by_rule, seconds
 
 

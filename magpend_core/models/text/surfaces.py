@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from magpend_core.models.text.tables import FUNCTION, Reader
 
 PLACE = "section.of"
 N_STATES = 64
-"""States at which an expression is looked at, each with parameters about those of the default."""
+"""States at which an expression is looked at."""
 STEP = 1e-4
 """Change of the states in differences, in units of their scales."""
 ALONG = 1e-6
@@ -51,7 +53,7 @@ def with_surface(model: TextModel, of: str) -> TextModel:
     tree = _parsed(own, of)
     if (problem := _names_problem(own, tree)) is not None:
         raise ParameterError([f"{PLACE} = {of!r}: {problem}"])
-    looked = _Looked(own, tree)
+    looked = _Looked(own, tree, _drawn(own))
     if (problem := looked.problem) is not None:
         raise ParameterError([f"{PLACE} = {of!r}: {problem}"])
     return model_of(replace(own, surface=tree, surface_unit=looked.unit), model.shipped)
@@ -60,9 +62,20 @@ def with_surface(model: TextModel, of: str) -> TextModel:
 def keeps_surface(model: TextModel, mirror: Mirror) -> bool:
     """Return whether a mirror symmetry of the states leaves the `surface` of a model as it is."""
     assert model.definition.surface is not None
-    looked = _Looked(model.definition, model.definition.surface)
+    looked = _Looked(model.definition, model.definition.surface, _drawn(model.definition))
     images = looked.at(looked.states * np.array(mirror.signs, np.float64))
     return bool((np.abs(images - looked.here) <= SAME * looked.size)[np.isfinite(looked.here)].all())
+
+
+def tangent_problem(model: TextModel, parameters: Mapping[str, float]) -> str | None:
+    """Return why no trajectory crosses a level of a model's `surface` at some parameters; None if some may."""
+    assert model.definition.surface is not None
+    return _Looked(model.definition, model.definition.surface, parameters).tangent_problem()
+
+
+def _drawn(own: Definition) -> dict[str, Any]:
+    chance, default = np.random.default_rng(8), own.presets[0].values
+    return {name: (value or 1.0) * chance.uniform(0.5, 1.5, N_STATES) for name, value in default.items()}
 
 
 def _parsed(own: Definition, of: str) -> Tree:
@@ -95,22 +108,17 @@ def _names_problem(own: Definition, tree: Tree) -> str | None:
 
 @dataclass(frozen=True)
 class _Looked:
-    """An expression at some states, with parameters about those of the default preset."""
+    """An expression at some states and parameters."""
 
     own: Definition
     tree: Tree
+    parameters: Mapping[str, Any]
 
     @cached_property
     def states(self) -> np.ndarray:
         ranges = [s.motion or (-s.scale, s.scale) for s in self.own.states]
         low, high = np.array(ranges).T
         return np.random.default_rng(7).uniform(low, high, (N_STATES, len(ranges)))
-
-    @cached_property
-    def parameters(self) -> dict[str, np.ndarray]:
-        chance, default = np.random.default_rng(8), self.own.presets[0].values
-        shares = {name: chance.uniform(0.5, 1.5, N_STATES) for name in default}
-        return {name: (value or 1.0) * shares[name] for name, value in default.items()}
 
     @cached_property
     def here(self) -> np.ndarray:
@@ -165,14 +173,15 @@ class _Looked:
             return None
         if (self.by_states[known] <= 1e-12 * self.size).all():
             return "is the same at all states, so nothing crosses its levels."
-        return self._tangent_problem()
+        return self.tangent_problem()
 
     def _differs(self, turn: float, i: int) -> bool:
         turned = self.states.copy()
         turned[:, i] += turn
         return bool((np.abs(self.at(turned) - self.here) > SAME * self.size).any())
 
-    def _tangent_problem(self) -> str | None:
+    def tangent_problem(self) -> str | None:
+        """Return what makes the expression no section if the motion does not change it."""
         given = {"t": 0.0, "f": 1.0, **by_name(self.own, self.states, self.parameters)}
         rates = rates_of(self.own, {"pi": math.pi, **given})
         flow = np.stack([np.broadcast_to(rates[s.name], N_STATES) for s in self.own.states], axis=1)

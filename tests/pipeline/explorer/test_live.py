@@ -63,9 +63,10 @@ def test_follow__period_of_a_cell_is_that_of_its_attractor(little):
 
 @pytest.fixture(scope="module")
 def directories(tmp_path_factory):
-    """Runs of a driven system, one of which stops when closed, and of a flow, with their attractors."""
+    """Runs of a driven system, one of which stops when closed, and of a flow at two sections, with attractors."""
     folder = tmp_path_factory.mktemp("live")
-    texts = {"whole": DRIVEN % (120, "false"), "closing": DRIVEN % (200, "true"), "flow": FLOW}
+    slanted = FLOW.replace('of = "y"', 'of = "y - 0.4*x + 0.2*x*y"')
+    texts = {"whole": DRIVEN % (120, "false"), "closing": DRIVEN % (200, "true"), "flow": FLOW, "slanted": slanted}
 
     class Made(dict):
         """Each run is made when it is asked for."""
@@ -146,11 +147,12 @@ def test_start__off_the_cube_is_told_by_its_orbit(directories, watch):
 
 
 @pytest.mark.slow
-def test_start__ends_of_a_flow(directories, watch):
+@pytest.mark.parametrize("name", ["flow", "slanted"])
+def test_start__ends_of_a_flow(directories, watch, name):
     """At rest or on the cycle, as the analysis says of the cell; what leaves, and what lies beside, says so."""
-    cube = RunDirectory.open(directories["flow"]).cube()
-    attractors = dense(derive(directories["flow"], "attractors"))
-    watcher, kinds = watch(directories["flow"]), set()
+    cube = RunDirectory.open(directories[name]).cube()
+    attractors = dense(derive(directories[name], "attractors"))
+    watcher, kinds = watch(directories[name]), set()
     for mu in (0, 1):
         for at in ((1, 1), (0, 0), (2, 2), (1, 2)):
             one, start = start_of(cube, {"mu": mu, "x_0": at[0], "y_0": at[1]})
@@ -335,8 +337,9 @@ def test_follow__refuses_with_a_sentence(directories, watch):
 
 
 @pytest.mark.slow
-def test_follow__of_a_flow(directories, watch):
-    live = LiveRun(RunDirectory.open(directories["flow"]))
+@pytest.mark.parametrize("name", ["flow", "slanted"])
+def test_follow__of_a_flow(directories, watch, name):
+    live = LiveRun(RunDirectory.open(directories[name]))
     watcher = watch(live)
     period = live.cube["orbit_period"].isel(mu=1).transpose("x_0", "y_0").values
     x, y = map(int, np.argwhere(period == 1)[0])
@@ -454,7 +457,7 @@ def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["whole", "closing", "flow"])
+@pytest.mark.parametrize("name", ["whole", "closing", "flow", "slanted"])
 def test_settle_cells__ends_where_the_analysis_follows(directories, name):
     """The live page and the analyses name the same attractor for the same initial states."""
     opened = RunDirectory.open(directories[name])

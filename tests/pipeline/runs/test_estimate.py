@@ -25,6 +25,14 @@ from pipeline.store import tasks
 from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import duffing
 
+NEVER = """
+kind = "sweep"
+model = { name = "spiral", states = { x = {}, y = {} }, equations = { x = "-x - y", y = "x - y" } }
+section = { of = "x + y", value = 9.0, longest = 5.0 }
+axes.section_value = { values = [9.0, 10.0] }
+initial_conditions = { kind = "list", points = [[1.0, 0.0]] }
+"""
+
 CLOSING = duffing(
     "frequency_hz = { start = 0.15, stop = 0.25, num = 5 }",
     'kind = "random"\nn = 64\nx = [-1, 1]\nv = [-1, 1]',
@@ -35,6 +43,10 @@ CLOSING = duffing(
 
 def read(text):
     return make_plan(Spec.parse(tomllib.loads(text)))
+
+
+def test_estimate__of_a_flow_that_does_not_return():
+    assert 0.0 <= estimate(read(NEVER)).core_seconds < 10.0
 
 
 def test_mean_with_tail():

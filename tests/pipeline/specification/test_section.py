@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.layout.cells import CellMap, coordinates
+from pipeline.layout.evaluation import check_starts
 from pipeline.layout.plan import make_plan
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
@@ -116,3 +117,19 @@ FREQUENCY = "a section by crossing needs no frequency; drop one of the two."
 def test_parse_spec__refused(changes, text):
     found = problems(**changes)
     assert any(p.startswith(text) for p in found), found
+
+
+def test_check_starts__what_the_motion_keeps_at_the_parameters_of_the_run():
+    """The energy of an oscillator is no section without damping, and is one where an axis has some."""
+    model = {
+        "name": "damped",
+        "states": {"x": {}, "v": {}},
+        "parameters": {"k": 2.0, "c": 0.0},
+        "equations": {"x": "v", "v": "-k*x - c*v"},
+        "quantities": {"energy": "k*x**2 + v**2"},
+    }
+    own = {**SPEC, "model": model, "section": {"of": "energy", "value": 1.0}, "axes": {"k": {"values": [1.0, 2.0]}}}
+    with pytest.raises(SpecError, match="'energy': at the run's parameters it does not change along the motion"):
+        check_starts(Spec.parse(own))
+    check_starts(Spec.parse({**own, "axes": {"c": {"values": [0.0, 0.5]}}}))
+    check_starts(Spec.parse({**own, "section": {"of": "energy - v", "value": 1.0}}))
