@@ -15,6 +15,8 @@ from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD, Settings, window_of
 from magpend_core.engine.system import System
 from magpend_core.models.model import Parameters
+from magpend_core.models.sectioned import sectioned
+from magpend_core.sizes import LEVEL
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_flag, check_frequency, check_states, check_tolerance
 
@@ -222,7 +224,7 @@ def sections(
     n_transient, n_keep, rtol, atol
         As for `run_branches`.
     options
-        Further keywords of `run_branches`.
+        Further keywords of `run_branches`. `section` can be a level of an expression, if the model is a text.
 
     Returns
     -------
@@ -241,6 +243,12 @@ def sections(
     (1, 1, 4)
     """
     several = [parameters] if isinstance(parameters, Parameters) else list(parameters)
+    crossing = options.pop("section", None)
+    if crossing is not None:
+        if frequency_hz is not None:
+            raise ValueError("frequency_hz must be None with a section by crossing: its periods are returns.")
+        several = [Parameters(sectioned(one.model, crossing), {**one, LEVEL: crossing.value}) for one in several]
+        frequency_hz = crossing.frequency_hz
     models = {one.model.name: one.model for one in several}
     if len(models) != 1 or any(one.model.system != several[0].model.system for one in several):
         raise ValueError(f"parameters: must be of one model, and are of {len(models)}: {', '.join(models)}.")
@@ -251,14 +259,11 @@ def sections(
             raise ValueError(f"frequency_hz = {frequency_hz}: {several[0].model.name} is a map; give None.")
         frequency_hz = 1.0
     if frequency_hz is None:
-        if options.get("section") is None:
-            raise ValueError("frequency_hz = None: give the drive's frequency, or a section by crossing.")
-        frequency = None
-    else:
-        frequency = check_frequency(frequency_hz, (0, 1))
-        frequency = np.full(len(initial), frequency) if frequency.ndim == 0 else frequency
-        frequency = frequency[:, None]
-    n = len(initial) if frequency is None else len(frequency)
+        raise ValueError("frequency_hz = None: give the drive's frequency, or a section by crossing.")
+    frequency = check_frequency(frequency_hz, (0, 1))
+    frequency = np.full(len(initial), frequency) if frequency.ndim == 0 else frequency
+    frequency = frequency[:, None]
+    n = len(frequency)
     if len(several) not in (1, n):
         raise ValueError(f"parameters: {len(several)} sets for {n} cells; give one, or one for each cell.")
     rows = np.stack([one.pack() for one in several])[:, None]

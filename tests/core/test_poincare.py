@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from magpend_core import load_model, lyapunov_exponents
+from magpend_core import load_model, lyapunov_exponents, sections
 from magpend_core.crossing import Crossing
 from magpend_core.engine.crossing import with_section, without_section
 from magpend_core.models.parameters import ParameterError
@@ -125,6 +125,14 @@ def test_section_map__differences(of):
     # images move along the surface
     normal = Section(system).normals(found.images[0, -1:], packed)[0]
     np.testing.assert_allclose(normal @ found.derivatives[0], 0.0, atol=1e-9)
+
+
+def test_sections__of_an_expression():
+    parameters, start = load_model("rossler").load(c=2.5), [[-2.0, -3.0, 0.05]]
+    found = sections(parameters, None, start, n_transient=0, n_keep=3, section=Crossing("x + y", 1.0, longest=50.0))
+    points, times = crossings(seen(ROSSLER, "x + y", 1.0, c=2.5), start[0], 3)
+    np.testing.assert_allclose(found.section[0], points, atol=1e-6)
+    np.testing.assert_allclose(found.return_time[0], times, atol=1e-6)
 
 
 def test_on_section__along_one_state():
