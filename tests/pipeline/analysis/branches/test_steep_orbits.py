@@ -47,7 +47,7 @@ def test_graded_multipliers__as_many_digits_for_the_small_ones():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("of", "period"), [("y", 1), ("y", 2), ("y + x*y - 3*(mu - 0.1)", 1), ("y + x*y - mu + 0.1", 2)]
+    ("of", "period"), [("y", 1), ("y", 2), ("y + 0.3*x*y - 3*(mu - 0.1)", 1), ("y + 0.3*x*y - mu + 0.1", 2)]
 )
 def test_cut_problem__is_the_orbit_of_the_whole_period(of, period):
     """The circle whose squared radius s has mu + s - s^2 = 0, once and twice; a turn has the multiplier
