@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -146,9 +147,7 @@ def section_map(
     # the longest first, so that the last of them do not run alone
     order = np.argsort(-periods, kind="stable")
     cells = integrate(
-        # tangents in the error control: near a rest the trajectory alone would allow any step, and a corner in
-        # the Jacobian leaves an error in the multipliers that the tolerance does not bound
-        dataclasses.replace(with_tangents(system, n), n_controlled=None),
+        _with_controlled_tangents(system),
         MAP,
         MapSettings(),
         parameters=packed[order, None, :],
@@ -190,6 +189,13 @@ def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np
     if section is None:
         return np.array(points, dtype=np.float64)
     return wrap_angles(section.placed(points, np.asarray(parameters)), system)
+
+
+@cache
+def _with_controlled_tangents(system: System) -> System:
+    # tangents in the error control: near a rest the trajectory alone would allow any step, and a corner in the
+    # Jacobian leaves an error in the multipliers that the tolerance does not bound
+    return dataclasses.replace(with_tangents(system, system.n_states), n_controlled=None)
 
 
 def wrap_angles(states: np.ndarray, system: System) -> np.ndarray:

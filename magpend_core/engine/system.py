@@ -7,6 +7,7 @@ import math
 from collections import namedtuple
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -290,7 +291,7 @@ class System:
         if not self.scales:
             object.__setattr__(self, "scales", self.units)
 
-    @property
+    @cached_property
     def plain(self) -> System:
         """The system as the cells of a run are integrated, with its `units` in place of the extent of the motion."""
         return replace(self, scales=self.units, farthest=1.0)
