@@ -55,9 +55,13 @@ def plot_tipping(
     """
     x = axis_name(str(ds.attrs["parameter"]))
     part = _selected(ds, at, x)
-    others = [d for d in split_dims(part["course"])[0] if d != x]
-    if len(others) > 1 or x not in part["course"].dims:
-        raise ValueError(f"a diagram shows one or two swept numbers; left are {', '.join([x, *others])} (--at)")
+    left, _ = split_dims(part["course"])
+    others = [d for d in left if d != x]
+    if len(others) > 1 or x not in left:
+        raise ValueError(
+            "a diagram has the swept number of --parameter, and at most one other; left are "
+            f"{', '.join(left) or 'none'}: choose values of others with --at"
+        )
     y = others[0] if others else START
     if others:
         n = part.sizes[START]

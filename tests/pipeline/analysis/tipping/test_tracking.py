@@ -117,5 +117,7 @@ def test_plot_tipping__bands_of_all_starts_over_one_number(swept) -> None:
     assert drawn(figure, "courses").get_array().reshape(2, 3).tolist() == [[1, 3, 3], [4, 1, 1]]
     np.testing.assert_allclose(drawn(figure, "critical").get_xydata(), [[0.13, 0], [0.15, 1]])
     assert not drawn(plot_tipping(swept, at={"size": 4.0}), "critical").get_xydata().size
-    with pytest.raises(ValueError, match="one or two swept numbers"):
+    with pytest.raises(ValueError, match="at most one other; left are third, size, rate"):
         plot_tipping(swept.expand_dims(third=[1.0, 2.0]))
+    with pytest.raises(ValueError, match="left are none"):
+        plot_tipping(swept, at={"size": 4.0, "rate": 0.1})
