@@ -197,24 +197,54 @@ def _continued(
     motion = Steady(model, run.spec.integration.model_copy(update=length))
     run.echo(f"tipping: continuing {len(paths)} attractors in {steps} steps")
     found, _ = motion.integrate(Inputs(there_and_back, frequency, starts), None)
-    last, back = found.section[:, :steps, -1], found.section[:, :steps:-1]
-    closed = (found.status[:, :steps] == Status.PERIODIC) & (found.status[:, :steps:-1] == Status.PERIODIC)
-    with np.errstate(invalid="ignore"):
-        near = Geometry.of(model).distance(back, last[:, :, None]).min(axis=-1) <= CELL_CLOSURE
     good = np.asarray(np.isin(found.status, GOOD).all(axis=1))
     code = np.where(good, 0, np.where((found.status == Status.DIVERGED).any(axis=1), ELSEWHERE, UNKNOWN_END))
-    which, step = np.nonzero(good[:, None] & ~(closed & near))
-    if len(which):
+    last, back = found.section[:, :steps, -1], found.section[:, :steps:-1]
+    closed = (found.status[:, :steps] == Status.PERIODIC) & (found.status[:, :steps:-1] == Status.PERIODIC)
+    with np.errstate(invalid="ignore"):  # ways that failed have no states
+        gap = Geometry.of(model).distance(back, last[:, :, None]).min(axis=-1)
+    gap[closed & (gap <= CELL_CLOSURE)] = 0.0
+    return found.section[:, steps, -1], _compared_steps(
+        run, there_and_back, frequency, (last, back[:, :, -1]), gap, code, options
+    )
+
+
+def _compared_steps(
+    run: OpenRun,
+    parameters: np.ndarray,
+    frequency: np.ndarray,
+    states: tuple[np.ndarray, np.ndarray],
+    gap: np.ndarray,
+    code: np.ndarray,
+    options: TippingOptions,
+) -> np.ndarray:
+    """Return the codes of ways, of which those with 0 are compared on the steps there and back; see `_continued`.
+
+    States (2, way, step, state) are those on the way there and back. Of each way the steps with the largest gaps
+    between these are compared.
+    """
+    most = 3  # steps of a way that are compared
+    model: Model = run.spec.model.still  # type: ignore[attr-defined]
+    code, unsure = code.copy(), np.zeros(len(code), bool)
+    order = np.argsort(-gap, axis=1)
+    for rank in range(min(most, order.shape[1])):
+        step = order[:, rank]
+        ways = np.flatnonzero((code == 0) & (gap[np.arange(len(gap)), step] > 0.0))
+        if not len(ways):
+            break
+        step = step[ways]
         finals = [
-            Final(_parameters(model, there_and_back[i, k]), frequency[i, 0]) for i, k in zip(which, step, strict=True)
+            Final(_parameters(model, row), hz)
+            for row, hz in zip(parameters[ways, step], frequency[ways, 0], strict=True)
         ]
-        ends = np.concatenate([last[which, step], back[which, step, -1]])
+        ends = np.concatenate([one[ways, step] for one in states])
         status = np.full(len(ends), int(Status.BOUNDED))
         there, again = np.split(Ends.of([*endings(run, finals * 2, ends, status, options)]).outcome, 2)
-        unsure = (there == UNKNOWN_END) | (again == UNKNOWN_END)
-        code[which[unsure]] = UNKNOWN_END
-        code[which[~unsure & (there != again)]] = ELSEWHERE
-    return found.section[:, steps, -1], code
+        unknown = (there == UNKNOWN_END) | (again == UNKNOWN_END)
+        unsure[ways] |= unknown
+        code[ways[~unknown & (there != again)]] = ELSEWHERE
+    code[unsure & (code == 0)] = UNKNOWN_END
+    return code
 
 
 def _parameters(model: Model, packed: np.ndarray) -> Parameters:
