@@ -277,7 +277,7 @@ class _Flood(Orbits):
         slope = w["slope"]
         with np.errstate(invalid="ignore", divide="ignore"):
             part = (slope - w["slope_before"]) * (w["det_before"] / (w["det_before"] - w["det"]))[:, None]
-        return np.asarray((part * slope).sum(axis=1) >= self.settings.singular * (slope**2).sum(axis=1))
+            return np.asarray((part * slope).sum(axis=1) >= self.settings.singular * (slope**2).sum(axis=1))
 
     def _begin_half(self, w: Any, ready: Array, v: Values) -> None:
         """Go on with orbits of half the period: the next step must pass a doubling of theirs."""
