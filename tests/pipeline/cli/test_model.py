@@ -166,11 +166,13 @@ def test_own_system__page_names_every_key_and_function():
 
 
 def test_own_system__section_without_a_drive_fits():
-    (section,) = re.findall(r"```toml\n(\[section\].*?)```", PAGE, re.DOTALL)
-    data = tomllib.loads(block("file: mine.toml", "toml") + "\n" + section)
-    data["model"]["equations"]["v"] = "(1 - x**2)*v - x"
-    del data["parameters"], data["model"]["define"], data["smoke"]
-    assert Spec.parse(data).section is not None
+    sections = re.findall(r"```toml\n(\[section\].*?)```", PAGE, re.DOTALL)
+    assert len(sections) == 2  # a state, and an expression
+    for section in sections:
+        data = tomllib.loads(block("file: mine.toml", "toml") + "\n" + section)
+        data["model"]["equations"]["v"] = "(1 - x**2)*v - x"
+        del data["parameters"], data["model"]["define"], data["smoke"]
+        assert Spec.parse(data).section is not None
 
 
 # ---- presets in files ------------------------------------------------------------------------------------
