@@ -82,7 +82,7 @@ def test_unsuited__what_follows_the_motion_of_a_map(tmp_path: Path) -> None:
     refused = {
         name for name, one in {**FIGURES, **ANALYSES}.items() if unsuited(iterated, one) and "steady" in one.motions
     }
-    assert refused == {"response", "backbone", "spectrum", "series", "gallery"}
+    assert refused == {"response", "backbone", "spectrum", "series", "phase", "gallery"}
     assert unsuited(iterated, FIGURES["gallery"]).endswith("and henon is a map, of iterates alone; draw its section.")
 
 
