@@ -210,8 +210,8 @@ def _attractors(shown: Shown) -> Iterator[Block]:
     rows: list[dict[str, Any]] = [dict(row) for row in table.rows]
     most, n_others = leading(rows, "attractor_id", "n_cells")
     yield Grid(*_attractor_grid(found, most, shown.axes), _counted(rows, told), command, n_others)
-    place = next(i for i, line in enumerate(table.lines) if line.startswith(told))  # it may point to a page
-    for remark in table.lines[place + 1 :]:
+    last = next(i for i, line in enumerate(table.lines) if line.startswith(told))  # it may point to a page
+    for remark in table.lines[last + 1 :]:
         yield Note(f"{remark[:1].upper()}{remark[1:]}.")
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
         yield from _drawn(shown, "attractors", "All coexisting attractors", **options)
