@@ -15,7 +15,7 @@ from magpend_core.models.text.grammar import Tree
 from pipeline.importing.expressions import RefusedError, names_in, replaced
 from pipeline.importing.numbers import constant
 from pipeline.importing.source import Reset, Source, text_of
-from pipeline.specification.problems import INSTALL, SpecError
+from pipeline.specification.problems import import_extra
 
 
 def read(path: Path) -> Source:
@@ -26,10 +26,7 @@ def read(path: Path) -> Source:
     SpecError
         If the library that reads SBML is not installed.
     """
-    try:
-        import libsbml
-    except ModuleNotFoundError:
-        raise SpecError(f"{path}: SBML is read by python-libsbml; {INSTALL.format('sbml')}.") from None
+    libsbml = import_extra("libsbml", "sbml", str(path))
     source = Source(path, "SBML")
     document = libsbml.readSBMLFromString(text_of(path))
     errors = [document.getError(i) for i in range(document.getNumErrors())]
