@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from magpend_core.models.drift.ramps import Ramp, RampOfCells, motion_of
 from magpend_core.models.model import Model, State
-from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
+from magpend_core.models.text.grammar import Tree
+from magpend_core.models.text.numeric import value_of
+from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, ORIGIN, START, grid_dim
 from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.specification.expressions import read_expression
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
 from pipeline.specification.tables import FREQUENCY, Range
@@ -68,6 +71,32 @@ class InitialStates:
                 assert dim is not None
                 out[:, i] = column[steps[dim]]
         return out
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Values from which the starts of states are counted: expressions of the parameters, by the number of the state."""
+
+    trees: Mapping[int, Tree]
+    names: tuple[str, ...]  # of the packed parameters
+    n_states: int
+
+    @classmethod
+    def of(cls, spec: Spec) -> Origins:
+        """Return those of a specification."""
+        texts, states = spec.initial_conditions.origin or {}, spec.model.state_names
+        own = spec.model.parameter_names
+        trees = {states.index(n): read_expression(f"origin.{n}", text, own) for n, text in texts.items()}
+        return cls(trees, spec.values.names, len(states))
+
+    def at(self, parameters: np.ndarray, frequency_hz: np.ndarray) -> np.ndarray:
+        """Return the origins at parameter points, shape (n, n_states), from packed parameters (n, n_parameters)."""
+        found = np.zeros((len(parameters), self.n_states))
+        known = {"pi": np.pi, "f": frequency_hz, **dict(zip(self.names, parameters.T, strict=True))}
+        with np.errstate(all="ignore"):
+            for i, tree in self.trees.items():
+                found[:, i] = value_of(tree, known)
+        return found
 
 
 def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
@@ -159,7 +188,17 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
         value = np.array(spec.frequency_hz, dtype=np.float64)
         found.append(Coordinate(FREQUENCY_DIM, (), value, attrs))
     states = initial_states(spec.initial_conditions)
-    return (*found, *(_branch_coords(spec, states) if spec.continuation else _start_coords(model, states)))
+    own = _branch_coords(spec, states) if spec.continuation else _start_coords(model, states)
+    return (*found, *(_counted_from(coordinate, spec.initial_conditions.origin or {}) for coordinate in own))
+
+
+def _counted_from(coordinate: Coordinate, origin: Mapping[str, str]) -> Coordinate:
+    """Return a coordinate of starts, with the expression from which they are counted among its attributes."""
+    text = next((text for state, text in origin.items() if grid_dim(state) == coordinate.name), None)
+    if text is None:
+        return coordinate
+    meaning = f"{coordinate.attrs['long_name']}, counted from {text}"
+    return replace(coordinate, attrs={**coordinate.attrs, "long_name": meaning, ORIGIN: text})
 
 
 def _parameter_attrs(name: str, model: Model) -> dict[str, str]:
@@ -220,6 +259,7 @@ class CellMap:
         self.fixed_hz = np.nan if spec.frequency_hz is None else spec.frequency_hz
         self.axes = parameter_axes(spec)
         self.states = initial_states(spec.initial_conditions)
+        self.origins = Origins.of(spec)
         self.walk = spec.continuation
         if self.walk is None:
             self.dims = (*(a.dim for a in self.axes), *self.states.dims)
@@ -241,8 +281,11 @@ class CellMap:
         for name, value in values.items():
             if name != FREQUENCY:
                 parameters[..., self.names.index(name)] = value
-        fixed = np.full(shape, self.fixed_hz)
-        return Inputs(parameters, values.get(FREQUENCY, fixed), self.states.at(self._start_of(index[:, :, 0])))
+        frequency = values.get(FREQUENCY, np.full(shape, self.fixed_hz))
+        states = self.states.at(self._start_of(index[:, :, 0]))
+        if self.origins.trees:
+            states += self.origins.at(parameters[:, 0], frequency[:, 0])
+        return Inputs(parameters, frequency, states)
 
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """Return slices that select the last cell of each branch of a block. All branches of the block must run in the

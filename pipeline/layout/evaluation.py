@@ -11,10 +11,12 @@ import numpy as np
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import SectionedModel
 from magpend_core.models.text.definition import OMEGA
+from magpend_core.models.text.grammar import names
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of
-from pipeline.layout.cells import initial_states, parameter_axes
+from pipeline.layout.cells import Origins, initial_states, parameter_axes
 from pipeline.specification.drift import MOST_CORNERS
+from pipeline.specification.expressions import read_expression
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
@@ -53,11 +55,40 @@ def check_starts(spec: Spec) -> None:
     chosen = np.unique(np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(np.int64))
     points = parameter_points(spec)
     model = load_model(spec.reference)
-    check_states(model, states.at(chosen), points)
+    _check_origins(spec)
+    check_states(model, states.at(chosen) + origins_at(spec, points)[:, None], points)
     if isinstance(model, TextModel) and model.clock.has_drive and spec.drive is None:
         _check_period(model, states.at(chosen[: len(SHARES)]), points)
     if isinstance(spec.model, SectionedModel):
         _check_section(spec.model, points)
+
+
+def origins_at(spec: Spec, points: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """Return the origins of the starts at parameter points, shape (point, n_states)."""
+    packed = np.array([[float(point[name]) for name in spec.values.names] for point in points])
+    frequency = np.array([np.nan if point[FREQUENCY] is None else point[FREQUENCY] for point in points], float)
+    return Origins.of(spec).at(packed, frequency)
+
+
+def _check_origins(spec: Spec) -> None:
+    """Raise SpecError for an origin of starts that has no finite value at some values of the axes."""
+    axes = {a.parameter: a.values for a in parameter_axes(spec)}
+    fixed = {**spec.values, FREQUENCY: spec.frequency_hz}
+    for state, text in (spec.initial_conditions.origin or {}).items():
+        tree = read_expression(f"origin.{state}", text, spec.model.parameter_names)
+        used = {FREQUENCY if name == "f" else str(name) for name, _ in names(tree)}
+        own = {name: values for name, values in axes.items() if name in used}
+        mesh = [m.ravel() for m in np.meshgrid(*own.values(), indexing="ij")] or [np.zeros(1)]
+        columns = dict(zip(own, mesh, strict=False))
+        points = [{**fixed, **dict(zip(columns, row, strict=True))} for row in zip(*columns.values(), strict=True)]
+        found = origins_at(spec, points or [fixed])[:, spec.model.state_names.index(state)]
+        if not np.isfinite(found).all():
+            k = int(np.argmin(np.isfinite(found)))
+            at = ", ".join(f"{name} = {float(values[k]):.6g}" for name, values in columns.items())
+            raise SpecError(
+                f"initial_conditions.origin.{state} = {text!r}: is {found[k]:g}{f' at {at}' if at else ''}; it must "
+                "have a finite value at all values of the axes."
+            )
 
 
 def parameter_points(spec: Spec) -> list[dict[str, Any]]:
@@ -135,7 +166,7 @@ def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str,
     model
         Any model; one that is not a text is not checked.
     states
-        Initial states in the model's units, shape (n, n_states).
+        Initial states in the model's units, shape (n, n_states), or (point, n, n_states).
     points
         Parameter points at which the states are checked: values by parameter name, and ``frequency_hz``
         (None for none).
@@ -149,8 +180,9 @@ def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str,
         return
     from magpend_core.models.text.domains import domain_faults
 
-    n = len(states)
-    columns = dict(zip(model.state_names, np.tile(states, (len(points), 1)).T, strict=True))
+    n = states.shape[-2]
+    many = np.broadcast_to(states, (len(points), *states.shape[-2:])).reshape(-1, states.shape[-1])
+    columns = dict(zip(model.state_names, many.T, strict=True))
     for name in model.parameter_names:
         columns[name] = np.repeat([float(p[name]) for p in points], n)
     zero = np.zeros(n * len(points))

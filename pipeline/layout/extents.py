@@ -24,7 +24,7 @@ from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.sizes import natural_size
 from pipeline.layout.cells import initial_states
-from pipeline.layout.evaluation import parameter_points
+from pipeline.layout.evaluation import origins_at, parameter_points
 from pipeline.specification.models import KEPT
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
@@ -101,7 +101,7 @@ def _measured(spec: Spec, model: TextModel) -> dict[str, tuple[float, tuple[floa
     points = [points[i] for i in np.unique(np.linspace(0, len(points) - 1, MOST_POINTS).astype(int))]
     states = initial_states(spec.initial_conditions)
     chosen = np.unique(np.linspace(0, len(states) - 1, MOST_MOVED // len(points)).astype(np.int64))
-    y = np.tile(states.at(chosen), (len(points), 1)).T
+    y = (states.at(chosen) + origins_at(spec, points)[:, None]).reshape(-1, len(model.states)).T
     columns: dict[str, Any] = {"pi": np.pi}
     for name in (*model.parameter_names, FREQUENCY):
         columns[name] = np.repeat(

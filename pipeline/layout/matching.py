@@ -108,6 +108,8 @@ class Finder:
             step, on = _on_axis(axis.values, self._values(inputs, axis.parameter))
             steps.append(step[:, None])
             here &= on
+        if self.cells.origins.trees:  # what is counted from an expression is not found again to the last bit
+            return np.full((n_branches, n_points), NOWHERE)
         start, on = self._starts.find(inputs.initial_states)
         here = np.repeat((here & on)[:, None], n_points, axis=1)
         if way is not None:
@@ -229,7 +231,9 @@ def apart(old: CellMap, new: CellMap) -> list[str]:
     for name in left:
         if not np.isin(_bits(right[name]), _bits(left[name])).any():
             lines.append(f"{name}: {_said(left[name])} there, {_said(right[name])} now; no value is the same")
-    if not _index(old.states).find(new.states.at(np.arange(len(new.states))))[1].any():
+    if old.origins.trees:
+        lines.append("initial_conditions: starts with an origin there, whose cells are not taken by other runs")
+    elif not _index(old.states).find(new.states.at(np.arange(len(new.states))))[1].any():
         lines.append("initial_conditions: no initial state is the same, to the last bit")
     return lines or ["there is no cell in which all parameters and the initial state are the same"]
 

@@ -58,6 +58,9 @@ UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES, 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN, CHATTER)
 """Status of cells that could not be integrated to the end."""
 
+ORIGIN = "counted_from"
+"""Attribute of a coordinate of starts: the expression of the parameters from which they are counted."""
+
 _GRID_SUFFIX = "_0"
 
 
@@ -74,6 +77,11 @@ def is_grid_dim(dim: str) -> bool:
 def is_start_dim(dim: str) -> bool:
     """Return whether a dim of the result cube runs over initial conditions or branches, not over a parameter."""
     return dim in (BRANCH, START, REALIZATION) or is_grid_dim(dim)
+
+
+def has_origins(ds: xr.Dataset) -> bool:
+    """Return whether the starts of cells are counted from expressions of the parameters."""
+    return any(ORIGIN in coordinate.attrs for coordinate in ds.coords.values())
 
 
 def start_dims(dims: Iterable[object]) -> tuple[str, ...]:

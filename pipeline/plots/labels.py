@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
 
 from pipeline.layout.conventions import shown_unit
-from pipeline.layout.vocabulary import axis_name, model_of, overrides_of
+from pipeline.layout.vocabulary import ORIGIN, axis_name, model_of, overrides_of
 from pipeline.plots.style import check_choice, join
 
 if TYPE_CHECKING:
@@ -106,9 +106,10 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
     """Return how the initial value of a state is shown on an axis."""
     model = model_of(ds)
     one = model.state(dim.removesuffix("_0"))
+    origin = ds.coords[dim].attrs.get(ORIGIN, "") if dim in ds.coords else ""
     return _measure(
         dim,
-        f"{one.symbol or one.name.replace('_', MATH_SPACE)}(0)",
+        f"{one.symbol or one.name.replace('_', MATH_SPACE)}(0)" + (f" \u2212 ({origin})" if origin else ""),
         one.unit,
         degrees and one.unit.startswith("rad"),
         one.on_circle,

@@ -3,42 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.text.calls import Writing
-from magpend_core.models.text.grammar import GrammarError, Tree, names, parse, unknown
+from magpend_core.models.text.grammar import Tree
 from magpend_core.models.text.numeric import value_of
 from pipeline.layout.evaluation import parameter_points
 from pipeline.layout.vocabulary import frequency_of, parameters_of, split_dims
 from pipeline.results.run import OpenRun
-from pipeline.results.selection import start_states
+from pipeline.results.selection import refuse_origins, start_states
+from pipeline.specification.expressions import read_expression
 from pipeline.specification.tables import FREQUENCY
-
-CONSTANTS = ("pi", "f")
-"""Names in every expression: pi, and the drive frequency [Hz]."""
-
-
-def read_expression(key: str, text: str, known: Iterable[str]) -> Tree:
-    """Parse the expression of an option, which may use some names and `CONSTANTS`; the option's name is for errors.
-
-    Raises
-    ------
-    ValueError
-        If it is no arithmetic expression (`magpend_core.models.text.grammar`), or uses another name.
-    """
-    known = [*known, *CONSTANTS]
-    try:
-        tree = parse(text)
-    except GrammarError as error:
-        raise ValueError(f"{key} = {text!r}: {error}.") from None
-    for name, at in names(tree):
-        if name not in known:
-            raise ValueError(f"{key} = {text!r}: {unknown(name, at, known, 'name')}.")
-    return Writing().out(tree, known)
 
 
 def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -> float:
@@ -57,6 +35,8 @@ def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -
 def check_density(run: OpenRun, text: str) -> None:
     """Raise ValueError unless an expression is a density of a run's starts, at both ends of every axis."""
     cube = run.cube()
+    if text != "1":
+        refuse_origins(cube, "a density")
     columns = start_states(cube, split_dims(cube["status"])[1]).T
     states = dict(zip(run.model.state_names, columns, strict=True))
     for point in parameter_points(run.spec):

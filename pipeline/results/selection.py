@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.layout.own_words import axis_in_own_words, rate_of
-from pipeline.layout.vocabulary import grid_dim, split_dims
+from pipeline.layout.vocabulary import grid_dim, has_origins, split_dims
 from pipeline.results.ragged import isel
 from pipeline.specification.problems import unknown_name
 from pipeline.specification.tables import FREQUENCY
@@ -30,7 +30,7 @@ def start_dims(attractors: xr.Dataset) -> list[str]:
 
 
 def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> npt.NDArray[np.float64]:
-    """Return the initial states of the cells of a parameter point, shape (cell, state)."""
+    """Return the initial states of the cells of a parameter point, shape (cell, state), counted from their origins."""
     shape = tuple(cube.sizes[d] for d in starts)
     columns = []
     for name in cube["state"].values:
@@ -38,6 +38,14 @@ def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> npt.NDArray[np.fl
         own = xr.DataArray(np.ones(shape), dims=starts) * column.drop_vars(list(column.coords))
         columns.append(own.transpose(*starts).values.ravel())
     return np.column_stack(columns)
+
+
+def refuse_origins(cube: xr.Dataset, what: str) -> None:
+    """Raise ValueError if the starts of cells are counted from expressions of the parameters."""
+    if has_origins(cube):
+        raise ValueError(
+            f"{what} needs the same starts at all parameters; this run counts them from initial_conditions.origin."
+        )
 
 
 def listed(text: str) -> list[str]:

@@ -125,6 +125,8 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
+    if drift and starts is not None and starts.origin:
+        problems.append("initial_conditions.origin: moving parameters leave no fixed origin; drop origin or [drift].")
     problems += moving.run_problems(drift, data, tables["integration"], starts)
     problems += size_problems(axes, starts)
     problems += _method_problems(tables["integration"], products, "drive" in data)

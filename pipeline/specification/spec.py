@@ -318,6 +318,7 @@ class Spec:
         /,
         *,
         refine: int | None = None,
+        origin: Mapping[str, str] | None = None,
         states: Mapping[str, Any] | None = None,
         **named: float | tuple[float, float, int] | Numbers | Mapping[str, Any],
     ) -> Self:
@@ -327,17 +328,22 @@ class Spec:
         ----------
         refine
             Stride of the cells that are computed first: 2, 4, 8, 16, 32, 64.
+        origin
+            Expressions of the parameters by state, from which its starts are counted: ``{"x": "sqrt(a)"}``.
         states
             States whose names are keywords here, such as ``states={"refine": (-1, 1, 11)}``; or any others.
         named
             States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number, ``(start, stop,
             num)``, a list of values, or a table with the keys of `with_axis`. States not given are 0.
         """
-        own = {"kind": "grid", "refine": refine, "states": states and {k: _range(v) for k, v in states.items()}}
+        own = {"kind": "grid", "refine": refine, "origin": origin and dict(origin)}
+        own["states"] = states and {k: _range(v) for k, v in states.items()}
         return self._replaced("initial_conditions", {**own, **{k: _range(v) for k, v in named.items()}})
 
     @knows_its_keys
-    def with_start_list(self, points: Rows | None = None, points_deg: Rows | None = None) -> Self:
+    def with_start_list(
+        self, points: Rows | None = None, points_deg: Rows | None = None, *, origin: Mapping[str, str] | None = None
+    ) -> Self:
         """Start from a list of initial states.
 
         Parameters
@@ -346,8 +352,11 @@ class Spec:
             Rows of states in their units.
         points_deg
             Rows in degrees and degrees/s.
+        origin
+            Expressions of the parameters by state, from which its starts are counted: ``{"x": "sqrt(a)"}``.
         """
-        return self._replaced("initial_conditions", {"kind": "list", "points": points, "points_deg": points_deg})
+        own = {"kind": "list", "points": points, "points_deg": points_deg, "origin": origin and dict(origin)}
+        return self._replaced("initial_conditions", own)
 
     @knows_its_keys
     def with_start_random(
@@ -357,6 +366,7 @@ class Spec:
         n: int,
         seed: int | None = None,
         sampling: Literal["sobol", "latin-hypercube"] | None = None,
+        origin: Mapping[str, str] | None = None,
         states: Mapping[str, float | tuple[float, float]] | None = None,
         **named: float | tuple[float, float],
     ) -> Self:
@@ -370,12 +380,15 @@ class Spec:
             Seed of the random numbers; 0 or more.
         sampling
             ``"sobol"`` or ``"latin-hypercube"``, which cover the box evenly; by default samples are independent.
+        origin
+            Expressions of the parameters by state, from which its starts are counted: ``{"x": "sqrt(a)"}``.
         states
             States whose names are keywords here, such as ``states={"n": (-1, 1)}``; or any others.
         named
             States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number or ``(low, high)``.
         """
-        own = {"kind": "random", "n": n, "seed": seed, "sampling": sampling, "states": states and dict(states)}
+        own = {"kind": "random", "n": n, "seed": seed, "sampling": sampling, "origin": origin and dict(origin)}
+        own["states"] = states and dict(states)
         return self._replaced("initial_conditions", {**own, **named})
 
     with_parameters = TableMethod(ParametersTable, "Set values of the model's parameters.")

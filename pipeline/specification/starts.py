@@ -14,7 +14,8 @@ from pydantic import AfterValidator, BaseModel, Discriminator, Field, Tag, creat
 
 from magpend_core.models.model import Model
 from magpend_core.models.text.keys import read_key
-from pipeline.specification.problems import shown
+from pipeline.specification.expressions import read_expression
+from pipeline.specification.problems import shown, unknown_name
 from pipeline.specification.tables import MAX_POINTS, Integration, Range, Table
 
 STATES = "states"
@@ -81,6 +82,7 @@ class _PerState(Table):
     """
 
     system: ClassVar[Model]
+    origin: Origin
     fields_by_key: ClassVar[Mapping[str, str]] = {}  # fields of the states, by state key
     own_keys: ClassVar[tuple[str, ...]] = ()  # keys of the table that set no state
 
@@ -103,6 +105,7 @@ class _PerState(Table):
 
     @model_validator(mode="after")
     def _one_unit(self) -> _PerState:
+        _check_origin(self.origin, self.system)
         given = self.given
         for name in self.system.state_names:
             if name in given and degrees_key(name) in given and degrees_key(name) not in self.system.state_names:
@@ -159,6 +162,25 @@ def put_start(table: dict[str, Any], key: str, value: Any, starts: GridStarts | 
         table[STATES] = below
 
 
+Origin = Annotated[
+    dict[str, str] | None,
+    Field(
+        None,
+        description="Expressions of the parameters (and f, pi) by state, from which its starts are counted: "
+        '`origin = {x = "sqrt(a)"}`.',
+    ),
+]
+"""Field of the tables of initial conditions with starts that depend on parameters."""
+
+
+def _check_origin(origin: Mapping[str, str] | None, model: Model) -> None:
+    """Raise ValueError unless each expression is one of parameters, of a state of the model."""
+    for state, text in (origin or {}).items():
+        if state not in model.state_names:
+            raise ValueError(f"origin: {unknown_name('state', state, model.state_names)}")
+        read_expression(f"origin.{state}", text, model.parameter_names)
+
+
 def _power_of_two(stride: int) -> int:
     if stride not in STRIDES:
         raise ValueError(f"{stride} is not among {', '.join(map(str, STRIDES))}; take one of these.")
@@ -195,9 +217,11 @@ class ListStarts(Table):
     kind: Literal["list"]
     points: Rows | None = Field(None, description="Rows of states in their units.")
     points_deg: Rows | None = Field(None, description="Rows in degrees and degrees/s.")
+    origin: Origin
 
     @model_validator(mode="after")
     def _rows(self) -> ListStarts:
+        _check_origin(self.origin, self.system)
         names = self.system.state_names
         degrees = all(s.unit in IN_DEGREES for s in self.system.states)
         if self.points_deg is not None and not degrees:

@@ -32,7 +32,7 @@ from pipeline.analysis.branches.known import Start, chords_at, same_others
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, sections_of
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, parameter_units, split_dims
+from pipeline.layout.vocabulary import DIVERGED, FAILED, ORIGIN, PENDING, grid_dim, parameter_units, split_dims
 
 VERDICTS = ("agrees", "missing", "diverged", "unfinished", "flow")
 """Values of `index_verdict`: whether the indices add up as expected. There is nothing to expect if cells of the run
@@ -147,6 +147,7 @@ def family_at(family: Family, value: float) -> Family:
 def _reach(cells: xr.Dataset, parameters: Parameters) -> np.ndarray:
     """Return the least and the largest initial state of some cells; 0 for a state without initial values."""
     own = [cells.coords.get(grid_dim(name)) for name in parameters.model.system.state_names]
+    own = [None if a is None or ORIGIN in a.attrs else a for a in own]  # counted from elsewhere
     return np.array([[0.0 if a is None else float(end(a)) for a in own] for end in (np.nanmin, np.nanmax)])
 
 

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.figure import plot_basins
 from pipeline.analysis.manifolds.declaration import ManifoldFigureOptions, ManifoldOptions
-from pipeline.layout.vocabulary import is_start_dim
+from pipeline.layout.vocabulary import has_origins, is_start_dim
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import fixed_of, with_diagram
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
@@ -82,7 +82,7 @@ def draw_manifolds(run: OpenRun, options: ManifoldFigureOptions) -> style.DataFi
     found = found.assign_coords(fixed_of(at_points(run.cube(), at).squeeze()))
     frame, below = frame_of(options), None
     starts = [str(d) for d in run.cube()["status"].dims if is_start_dim(str(d))]
-    if len(starts) == 2:
+    if len(starts) == 2 and not has_origins(run.cube()):
         attractors = run.derive("attractors")
         below = plot_basins(attractors, at=at, degrees=options.degrees, frame=frame)
     return noted(plot_manifolds(found, below, degrees=options.degrees, frame=frame), notes)

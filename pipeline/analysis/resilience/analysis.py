@@ -34,12 +34,12 @@ from pipeline.analysis.resilience.shocks import (
 )
 from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, section_attributes, split_dims, told_by
 from pipeline.products.product import Table
-from pipeline.results.expressions import check_density, density_at, mean_over_cells, read_expression
+from pipeline.results.expressions import check_density, density_at, mean_over_cells
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import DIVERGED, outcomes
 from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.results.run import OpenRun
-from pipeline.results.selection import listed, select_points, start_states
+from pipeline.results.selection import listed, refuse_origins, select_points, start_states
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import (
     FEW_POINTS,
@@ -54,6 +54,7 @@ from pipeline.results.tabular import (
     values,
     with_interval,
 )
+from pipeline.specification.expressions import read_expression
 
 _ENDS = {-1: "-", DIVERGED: "diverges", -3: "elsewhere"}
 
@@ -80,6 +81,7 @@ def needs_sweep(run: OpenRun, options: ResilienceOptions) -> None:
     """Raise ValueError unless the run has independent initial states and the options suit it."""
     cube = run.cube()
     check_starts(cube)
+    refuse_origins(cube, "resilience")
     select_points(cube, options.at)
     _chosen(run, options)
     check_density(run, options.density)

@@ -40,7 +40,7 @@ from pipeline.products.product import Table
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import padded
 from pipeline.results.run import OpenRun
-from pipeline.results.selection import select_points, start_states
+from pipeline.results.selection import refuse_origins, select_points, start_states
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import Row, Words, aligned, counted, plain, words_of
 from pipeline.results.tolerances import SAME_EQUILIBRIUM
@@ -52,6 +52,7 @@ def needs_pair(run: OpenRun, options: EdgeOptions) -> None:
     """Raise ValueError unless the run has independent initial states and the options choose a parameter point."""
     cube = run.cube()
     check_starts(cube)
+    refuse_origins(cube, "the search of edge states")
     select_points(cube, options.at, purpose=PURPOSE)
     first, second = _letters(options.between)
     if first == second:

@@ -11,11 +11,13 @@ import numpy as np
 
 from pipeline.explorer import RequestError
 from pipeline.layout.cells import parameter_axes
+from pipeline.layout.evaluation import origins_at
 from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
 from pipeline.motion.steady import Inputs
 from pipeline.runs.derive import stored_each
 from pipeline.specification.problems import unknown_name
+from pipeline.specification.tables import FREQUENCY
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in
 from pipeline.store.run import RunDirectory
@@ -151,6 +153,13 @@ class ExploredRun(RunDirectory):
     def n_keep(self) -> int:
         """Number of section points stored for each cell."""
         return int(self.plan.sizes["period_index"])
+
+    def origins(self, index: Mapping[str, int]) -> dict[str, float]:
+        """Return the values from which the starts of each state are counted, at indices on the parameter dims."""
+        spec = self.plan.spec
+        swept = {axis.parameter: float(axis.values[index.get(axis.dim, 0)]) for axis in parameter_axes(spec)}
+        (found,) = origins_at(spec, [{**spec.values, FREQUENCY: spec.frequency_hz, **swept}])
+        return dict(zip(spec.model.state_names, found.tolist(), strict=True))
 
     def check_axes(self, at: Mapping[str, int]) -> None:
         """Raise RequestError if the run has no axis of one of the given names."""

@@ -394,7 +394,8 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
         if number >= 0:
             others = [tuple(int(i) for i in row) for row in np.argwhere(ids == number)[: most + 1]]
             chosen += [row for row in others if row != own]
-    columns = {s.name: _starts_of(run, grid_dim(s.name)) for s in run.model.states}
+    origin = run.origins(cell.index)
+    columns = {s.name: _starts_of(run, grid_dim(s.name)) + origin[s.name] for s in run.model.states}
     return [
         {**{name: float(values[row]) for name, values in columns.items()}, "label": _seed_label(cube, run, row)}
         for row in chosen[:most]

@@ -78,10 +78,11 @@ def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: l
     label = _labels(part, scheme).transpose(upwards, across)
     u, v = (np.asarray(part[d].values, np.float64) for d in (across, upwards))
     columns, rows = np.argsort(u, kind="stable"), np.argsort(v, kind="stable")
-    states = (_state_of(run, across), _state_of(run, upwards))
+    states, origin = (_state_of(run, across), _state_of(run, upwards)), run.origins(place)
+    u, v = u + origin[states[0]], v + origin[states[1]]
     return Plane(
         states,
-        _fixed(run, part, states),
+        _fixed(run, part, states, origin),
         _categories(scheme, label.values),
         "basins" if scheme.name == "attractor" else "starts",
         u[columns],
@@ -99,9 +100,12 @@ def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Pl
     states = pairs[0] if pairs else (names[0], names[-1])
     part = _part(run, scheme, place)
     label = _labels(part, scheme)
-    columns = [_spread(part, grid_dim(name), label) for name in states]
+    origin = run.origins(place)
+    columns = [_spread(part, grid_dim(name), label) + origin[name] for name in states]
     shown, starts = label.values.ravel(), np.stack(columns, axis=1)
-    return Plane(states, _fixed(run, part, states), _categories(scheme, shown), starts=starts, start_label=shown)
+    return Plane(
+        states, _fixed(run, part, states, origin), _categories(scheme, shown), starts=starts, start_label=shown
+    )
 
 
 def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:
@@ -140,13 +144,15 @@ def _state_of(run: ExploredRun, dim: str) -> str:
     return next(s.name for s in run.model.states if grid_dim(s.name) == dim)
 
 
-def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[str, float]:
+def _fixed(
+    run: ExploredRun, part: xr.Dataset, states: tuple[str, str], origin: Mapping[str, float]
+) -> dict[str, float]:
     """Return the other states, outside the plane, that have the same value in all initial states, by name."""
     found = {}
     for state in run.model.states:
         values = np.unique(np.asarray(part.coords[grid_dim(state.name)].values, np.float64))
         if state.name not in states and values.size == 1:
-            found[state.name] = float(values[0])
+            found[state.name] = float(values[0]) + origin[state.name]
     return found
 
 

@@ -85,7 +85,8 @@ def _names(run: RunDirectory, region: Region, swept: list[str]) -> tuple[str, st
     names = [name for name in region.axes if name is not None]
     given = [name.removesuffix("_0") if is_grid_dim(name) else parameter_name(name) for name in names]
     states = run.model.state_names
-    has_ranges = isinstance(run.spec.initial_conditions, GridStarts | RandomStarts)
+    starts = run.spec.initial_conditions
+    has_ranges = isinstance(starts, GridStarts | RandomStarts) and not starts.origin
     known = [*swept, *(states if has_ranges else ())]
     first = given[0]
     if first not in known:
