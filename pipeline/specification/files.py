@@ -306,7 +306,7 @@ def toml_value(value: Any) -> str:
         if any(isinstance(v, list | tuple) for v in value):
             return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
         return "[" + ", ".join(items) + "]"
-    return repr(value)
+    return repr(value.item() if hasattr(value, "item") else value)  # numbers of numpy, too
 
 
 def _toml_of(key: str, value: Any) -> str:

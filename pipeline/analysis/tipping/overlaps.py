@@ -16,7 +16,7 @@ from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import dense
 from pipeline.results.run import OpenRun
-from pipeline.results.selection import choose, place, start_dims
+from pipeline.results.selection import choose, place, refuse_origins, start_dims
 from pipeline.results.tabular import Row, aligned, with_interval
 
 NO_LABEL_KNOWN = -1
@@ -40,6 +40,7 @@ def needs_basins(run: OpenRun, options: OverlapOptions) -> None:
     """Raise ValueError unless the run has basins at both values of the parameter."""
     cube = run.cube()
     check_starts(cube)
+    refuse_origins(cube, "the overlap of basins")
     axis = axis_name(options.parameter)
     if axis not in cube["status"].dims:
         raise ValueError(f"{options.parameter} is not an axis of this run; sweep it over both values.")

@@ -100,7 +100,7 @@ def test_run__has_the_cells_of_runs_with_these_starts(tmp_path) -> None:
     assert cube["x_0"].attrs["counted_from"] == "sqrt(a)"
     assert cube["x_0"].attrs["long_name"].endswith("counted from sqrt(a)")
     for i, a in enumerate([0.25, 1.0, 4.0]):
-        points = [[float(x + np.sqrt(a)), v + a * 0.3] for x in (-0.1, 0.0, 0.1) for v in (0.0, 0.2)]
+        points = [[x + np.sqrt(a), v + a * 0.3] for x in (-0.1, 0.0, 0.1) for v in (0.0, 0.2)]
         starts = {"kind": "list", "points": points}
         axes = {"a": {"values": [a]}, "frequency_hz": {"values": [0.3]}}
         own = spec_of("list", None, axes=axes, initial_conditions=starts)
@@ -113,6 +113,8 @@ def test_run__has_the_cells_of_runs_with_these_starts(tmp_path) -> None:
         run.basins(density="exp(-x**2)")
     with pytest.raises(SpecError, match="resilience needs the same starts"):
         run.resilience()
+    with pytest.raises(SpecError, match="the overlap of basins needs the same starts"):
+        run.overlaps(parameter="a", before=0.25, after=1.0, at={"frequency": 0.3})
     assert (
         "\u2212 (sqrt(a))" in magpend.figure(run, "basins", {"at": {"a": 1.0, "frequency": 0.3}}).axes[0].get_xlabel()
     )
