@@ -371,7 +371,7 @@ def test_accessor__refuses_wrong_datasets_in_a_sentence(run):
         (lambda: xr.Dataset().magpend.model, r"no cube of magpend\.open_run and no result"),
         (lambda: cube.magpend.table(), "not the result of an analysis"),
         (lambda: run.attractors().magpend.plot, r"needs a cube of magpend\.open_run, and this is attractors"),
-        (lambda: cube.magpend.plot.fractions(), r"needs the analysis attractors.*use run\.plot"),
+        (lambda: cube.magpend.plot.attractors(), r"needs the analysis attractors.*use run\.plot"),
         (lambda: cube.magpend.plot.branches(), r"branches needs an analysis.*use run\.plot"),
         (lambda: xr.Dataset(attrs=cube.attrs).magpend.run(), r"open the run with magpend\.Run\.open"),
     ):

@@ -155,6 +155,7 @@ def test_dependencies__are_all_packages_that_are_imported():
     extras = [text for listed in PROJECT["optional-dependencies"].values() for text in listed]
     named = {re.split(r"[\[>]", text)[0].lower().replace("-", "_") for text in (*PROJECT["dependencies"], *extras)}
     named |= {"ipython"}  # asked for only where it runs already
+    named |= {"libsbml"}  # of python-libsbml
     named |= {"pil", "pydantic_core", *(name.strip("/") for name in PACKAGES), "magpend"}  # pillow, a part of pydantic
     for name in installed_names():
         if not name.endswith(".py") or name == "workflows/magnet/make_discs.py":  # a script for developers
