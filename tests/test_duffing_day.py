@@ -308,6 +308,7 @@ def test_plot__leaves_the_rc_params_of_given_axes(drawn, day, words):
         (before,) = ax.plot([], [], "C3")
         assert getattr(run.plot, name)(ax=ax, **options) is ax
     figure.canvas.draw()
+    plt.close(figure)
     assert {label.get_size() for label in (ax.xaxis.label, ax.yaxis.label)} == {21.0}
     for tick in (*ax.xaxis.get_major_ticks(), *ax.yaxis.get_major_ticks()):
         assert (tick.get_tickdir(), tick.label1.get_size()) == ("inout", 19.0)

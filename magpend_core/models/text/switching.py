@@ -250,7 +250,7 @@ class Sides:
         phase, duty = node.args
         (slope,) = derivatives(g, (phase,), {g.leaf("time"): g.one})
         (offset,) = _at_time_zero(g, phase)
-        count = _multiple_of(slope, g.leaf("frequency"))
+        count = None if _jumps(phase) else _multiple_of(slope, g.leaf("frequency"))
         if not more or count is None or duty.kind != CONSTANT or offset.kind != CONSTANT:
             if more and node.kind != CONSTANT:
                 self.left.append(node)
@@ -294,7 +294,7 @@ class Sides:
         (slope,) = derivatives(g, (u,), {g.leaf("time"): g.one})
         (offset,) = _at_time_zero(g, u)
         way = -1.0 if slope.op == "neg" else 1.0
-        count = _multiple_of(g.mul(g.number(way), slope), g.leaf("frequency"))
+        count = None if _jumps(u) else _multiple_of(g.mul(g.number(way), slope), g.leaf("frequency"))
         if count is None or offset.kind != CONSTANT:
             return None
         steps = []
@@ -318,6 +318,11 @@ class Sides:
         for rank in ranks[1:]:
             found = self.graph.call("minimum", found, rank)
         return found
+
+
+def _jumps(phase: Node) -> bool:
+    """Return whether a phase has corners or jumps in time, so that its slope alone does not tell where it turns."""
+    return any(n.op in CORNERED and n.kind != CONSTANT for n in in_order([phase]))
 
 
 def _moves(rewritten: Node) -> bool:

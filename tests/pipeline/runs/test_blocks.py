@@ -202,7 +202,20 @@ PARTS = {
     "tangency": {**AT, "length": 0.5, "starts": 60, "parameter": "amplitude", "low": 0.3, "high": 0.31},
     "sensitivities": {"parameter": "amplitude", "deviation": {"damping": 0.01}},
     "bands": {"parameter": "amplitude", "posterior": "posterior.nc"},
+    "phase": {"phases": 16},
 }
+CYCLES = """
+kind = "sweep"
+model.name = "hopf"
+model.states = { x = {}, y = {} }
+model.parameters = { a = 1.0 }
+model.equations.x = "a*x - 3*y - (x*x + y*y)*x"
+model.equations.y = "3*x + a*y - (x*x + y*y)*y"
+section = { of = "y", value = 0.0, direction = "up", longest = 20.0 }
+axes = { a = { values = [0.5, 0.75, 1.0] } }
+initial_conditions = { kind = "list", points = [[0.3, 0.0], [1.2, 0.0]] }
+integration = { n_transient = 10, n_keep = 4 }
+"""
 
 
 def test_divided__parts_are_in_blocks_of_some(copy, monkeypatch):
@@ -216,7 +229,7 @@ def test_divided__parts_are_in_blocks_of_some(copy, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, one in ANALYSES.items() if one.parts])
 def test_in_blocks__every_analysis_of_parts(name, pairs, monkeypatch, tmp_path):
-    one, other = pairs(CHAOTIC_ROW if name == "bands" else CHAOTIC)
+    one, other = pairs({"bands": CHAOTIC_ROW, "phase": CYCLES}.get(name, CHAOTIC))
     monkeypatch.chdir(tmp_path)
     draws = xr.Dataset({"value": (("draw", "parameter"), [[0.099], [0.1], [0.101]])}, {"parameter": ["damping"]})
     draws.assign_attrs(identified="damping").to_netcdf("posterior.nc", engine="scipy")
@@ -358,4 +371,4 @@ def test_run__analyse(main, write_spec):
     code, out, err = main(*words, " attractors,basins")
     assert code == 0, err
     assert "end on attractors" in out
-    assert "boundaries: the starts are no grid" in out
+    assert "uncertainty exponent and Wada test: the starts are no grid" in out

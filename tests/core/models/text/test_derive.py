@@ -9,7 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
-from hypothesis import given, reject
+from hypothesis import example, given, reject
 from hypothesis import strategies as st
 
 from magpend_core import evaluate, sections
@@ -128,6 +128,7 @@ def test_rates__are_what_the_text_says(text, x, v):
 
 
 @pytest.mark.slow
+@example("square(2*t*f + sin(square(2*t*f + a, 0.3)), 0.3)", 1.0, 0.0)
 @given(CORNERED, st.floats(0.11, 2.0), st.floats(-2.0, 2.0))
 def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
     model = model_with_value(text)
