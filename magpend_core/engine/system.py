@@ -298,7 +298,7 @@ class System:
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
-        """All compiled functions of the system, as a tuple."""
+        """The compiled functions that the system has, in a fixed order."""
         always = self.constants, self.forcing, self.rhs, self.edges, self.layers
         others = self.jacobian, self.quantities, self.switches, self.impacts, self.reset, self.surface
         return (*always, *(f for f in others if f is not None))

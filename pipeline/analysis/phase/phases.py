@@ -90,18 +90,19 @@ def gradient_at(flow: Parameters, seconds: float, states: np.ndarray) -> Gradien
 def states_along(cycle: Cycle, n: int) -> np.ndarray:
     """Return the states of a cycle at n even phases from 0 on, shape (n, state)."""
     flow = of_flow(cycle.parameters)
-    often = np.array([n / cycle.seconds])
-    images = section_map(flow.pack()[None], often, cycle.points[:1], n, rtol=BRANCH_RTOL, system=flow.model.system)
+    rate_hz = np.array([n / cycle.seconds])
+    images = section_map(flow.pack()[None], rate_hz, cycle.points[:1], n, rtol=BRANCH_RTOL, system=flow.model.system)
     return np.concatenate([cycle.points[:1], images.images[0, :-1]])
 
 
 def phases_of(cycle: Cycle, states: np.ndarray) -> np.ndarray:
-    """Return the phases to which states tend, shape (n,), 0 to 1; NaN of those that do not come back to the cycle."""
-    # distance from the cycle [scaled] at which phases are read: the error is of the order of its square; and most
-    # turns until then
+    """Return the phase of the cycle on which each state ends, shape (n,), 0 to 1; NaN if it does not come back."""
+    # distance from the cycle [scaled] within which a state is back: the phase has an error of the order of its square;
+    # and most turns until then
     near, most_turns = 1e-5, 400
     system, q = cycle.parameters.model.system, len(cycle.points)
     turns = np.log(near) / np.log(max(cycle.contraction, 1e-300))
+    # twice as many, as states far away come near later than the multiplier says
     n_returns = q * int(np.clip(np.ceil(2.0 * turns) + 2, 4, most_turns))
     n = len(states)
     ends = run_branches(
@@ -118,7 +119,7 @@ def phases_of(cycle: Cycle, states: np.ndarray) -> np.ndarray:
     away = np.stack([scaled_distance(last, point, system) for point in cycle.points])
     nearest = np.argmin(np.where(np.isfinite(away), away, np.inf), axis=0)
     ahead = (cycle.point_gradient[nearest] * wrap_angles(last - cycle.points[nearest], system)).sum(axis=1)
-    is_back = np.isfinite(times) & (away[nearest, np.arange(n)] < 100.0 * near)
+    is_back = np.isfinite(times) & (away[nearest, np.arange(n)] < near)
     is_back &= np.isin(ends.status[:, 0], (Status.BOUNDED, Status.PERIODIC))
     phase = (cycle.point_phase[nearest] + ahead - times / cycle.seconds) % 1.0
     return np.where(is_back, phase, np.nan)

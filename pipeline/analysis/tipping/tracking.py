@@ -218,7 +218,9 @@ def _compared_steps(
     code: np.ndarray,
     options: TippingOptions,
 ) -> np.ndarray:
-    """Return the codes of ways, of which those with 0 are compared on the steps there and back; see `_continued`.
+    """Compare the attractors of each way there and back; return the code of each way, see `_continued`.
+
+    Only ways with the code 0 are compared; the others keep theirs.
 
     States (2, way, step, state) are those on the way there and back. Of each way the steps with the largest gaps
     between these are compared.

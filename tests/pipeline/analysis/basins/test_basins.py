@@ -191,7 +191,7 @@ def test_scattered_entropy__of_a_straight_boundary():
     assert [int(found["n_boxes"]) for found in several] == [100] * 17
     entropy, boundary = (np.mean([float(found[name]) for found in several]) for name in ("entropy", "boundary_entropy"))
     assert entropy == pytest.approx(16 * 0.5 / (10 + 15 * 9), rel=0.05)
-    assert boundary == pytest.approx(0.5, rel=0.25)
+    assert boundary == pytest.approx(0.5, rel=0.05)
     assert all(found["entropy_low"] < found["entropy"] < found["entropy_high"] for found in several)
     # riddled basins: each box has both labels in even shares
     mixed = scattered_entropy(states, rng.integers(0, 2, 40_000), 400)
