@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -112,6 +113,15 @@ def run_task(
         "write_s": round(time.perf_counter() - computed, 4),
         **({"reused": sum(taken)} if sources else {}),
     }
+
+
+def run_numbered(jobs: Sequence[Callable[[int], dict[str, Any]]], firsts: Sequence[int], number: int) -> dict[str, Any]:
+    """Compute one task of several runs whose tasks have one numbering; the result's ``run`` is the index of its run.
+
+    `jobs` compute a task of each run, see `run_task`; `firsts` are the numbers of the runs' first tasks.
+    """
+    k = bisect_right(firsts, number) - 1
+    return {**jobs[k](number - firsts[k]), "run": k}
 
 
 def _left(info: RunInfo, index: int) -> dict[str, Any]:

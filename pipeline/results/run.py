@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import xarray as xr
@@ -50,4 +50,11 @@ class OpenRun(Protocol):
         """Return the run beside this one that has further values of the one swept parameter; compute what it lacks.
 
         Without any values it is the run beside as it is, or this run if there is none.
+        """
+
+    def at_points(self, points: Sequence[Mapping[str, float]], n_starts: int | Sequence[int]) -> Sequence[OpenRun]:
+        """Return the run beside this one at each of some single points of the swept parameters, with a number of
+        starts; compute what they lack.
+
+        `pipeline.runs.beside.runs_at` says what points and starts are.
         """

@@ -35,8 +35,8 @@ from pipeline.layout.vocabulary import axis_name, model_attribute, overrides_att
 from pipeline.products.product import Analysis, Figure, Options, Table, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import silent
+from pipeline.runs.beside import refine, runs_at
 from pipeline.runs.choices import Choices, branches_in_words, changed_branches, chosen_options, is_choice
-from pipeline.runs.extend import refine
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
 from pipeline.runs.suitability import unsuited
@@ -99,13 +99,22 @@ class AnalysedRun(RunDirectory):
         return Choices.of(self).along(parameter_name(parameter))
 
     def with_values(self, values: Sequence[float]) -> AnalysedRun:
-        """Return the run beside this one that has further values of the swept parameter, see `extend.refine`; its
+        """Return the run beside this one that has further values of the swept parameter, see `beside.refine`; its
         attractors and branches are found with the same options.
         """
         beside = refine(self, values, workers=self.workers, where=self.where, echo=self.echo)
-        if beside is self:
-            return self
-        found = AnalysedRun.of(beside, self.echo, workers=self.workers, where=self.where)
+        return self if beside is self else self._beside(beside)
+
+    def at_points(self, points: Sequence[Mapping[str, float]], n_starts: int | Sequence[int]) -> list[AnalysedRun]:
+        """Return the runs beside this one at single points of the swept parameters, see `beside.runs_at`; their
+        attractors and branches are found with the same options.
+        """
+        found = runs_at(self, points, n_starts, workers=self.workers, where=self.where, echo=self.echo)
+        return [self._beside(run) for run in found]
+
+    def _beside(self, run: RunDirectory) -> AnalysedRun:
+        """Open a run beside this one for analyses, with the same places and choices."""
+        found = AnalysedRun.of(run, self.echo, workers=self.workers, where=self.where)
         if (chosen := Choices.of(self)) != Choices.of(found):
             chosen.keep(found)
         return found

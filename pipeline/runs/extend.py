@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from pipeline.layout.evaluation import check_starts
 from pipeline.layout.extents import with_sizes
@@ -32,15 +29,11 @@ from pipeline.runs.zoom import Widening, derived_toml, widened
 from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
-from pipeline.specification.tables import FREQUENCY, RATES
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files
 from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import is_run
-
-if TYPE_CHECKING:
-    from pipeline.compute.clients import Where
 
 
 @dataclass(frozen=True)
@@ -111,15 +104,15 @@ def plan_extension(
     wide, text = _wide(runs[0], spec, widening or Widening())
     check_starts(wide)
     plan = make_plan(wide, text)
-    fitting, notes = _fitting(runs, plan)
-    counts = _census(plan, fitting)
+    fit, notes = fitting(runs, plan)
+    counts = _census(plan, fit)
     if not sum(counts):
-        reasons = notes + [line for run in fitting for line in _strangers(run, plan)]
+        reasons = notes + [line for run in fit for line in _strangers(run, plan)]
         raise RefusedError(
             "no cell can be reused, so a new run is as quick (magpend run SPEC --out NEW). "
             "Differences:\n  " + "\n  ".join(reasons)
         )
-    return Extension(plan, tuple(fitting), tuple(counts), tuple(notes))
+    return Extension(plan, tuple(fit), tuple(counts), tuple(notes))
 
 
 def _wide(run: RunDirectory, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
@@ -138,21 +131,21 @@ def _wide(run: RunDirectory, spec: str | Path | None, widening: Widening) -> tup
     return wide, derived_toml("Extended", origin, wide)
 
 
-def _fitting(runs: Sequence[RunDirectory], plan: Plan) -> tuple[list[RunDirectory], list[str]]:
+def fitting(runs: Sequence[RunDirectory], plan: Plan) -> tuple[list[RunDirectory], list[str]]:
     """Select the earlier runs whose cells can be copied, with notes on the others."""
     from pipeline.compute.reuse import obstacles
 
-    fitting, notes = [], []
+    fit, notes = [], []
     for run in runs:
         lines = obstacles(run, plan)
         if lines:
             notes.append(f"{run.name}: none of its cells can be reused ({'; '.join(lines)})")
             continue
-        fitting.append(run)
+        fit.append(run)
         if not run.complete:
             some = f"only its {run.n_committed} of {run.plan.n_cells} committed cells are reused"
             notes.append(f"{run.name}: is not complete; {some}")
-    return fitting, notes
+    return fit, notes
 
 
 def _census(plan: Plan, runs: Sequence[RunDirectory]) -> list[int]:
@@ -247,12 +240,12 @@ def extend(
     widening = Widening(axes or {}, starts, keep, products or {})
     first = open_files(source)
     in_place = out is None or open_files(out).place == first.place
-    built = open_files(_beside(_folder(first)) if in_place else str(out))
+    built = open_files(extending_folder(_folder(first)) if in_place else str(out))
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.place)
     where.resolved()
     how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
     if in_place:
-        _finish_exchange(_folder(first), echo)
+        finish_exchange(_folder(first), echo)
     extension = plan_extension((source, *also), spec, widening)
     if not in_place:
         return _build(extension, built, **how)
@@ -262,7 +255,7 @@ def extend(
     _refuse_loss(old, extension.plan)
     with first.lock():
         _build(extension, built, **how)
-        _exchange(_folder(first), _folder(built), echo)
+        exchange(_folder(first), _folder(built), echo)
     return state(first)
 
 
@@ -297,110 +290,6 @@ def _record(extension: Extension, files: Files) -> int:
     return reused
 
 
-# ---- further values ----------------------------------------------------------------------------
-
-
-def refine(
-    source: str | Path | RunDirectory,
-    values: Sequence[float],
-    *,
-    workers: int | None = None,
-    where: Where | None = None,
-    echo: Echo = print,
-) -> RunDirectory:
-    """Return the run beside a run that also has further values of its swept parameter, and compute what that lacks.
-
-    The run beside has the name ``NAME-refined``, the specification of the run with all further values so far, and the
-    bytes that a run of this specification from nothing has. Cells are copied where that is possible: in a continuation
-    up to the first further value. If it is killed at any moment, the next call completes it.
-
-    Parameters
-    ----------
-    source
-        Run directory, or an opened run; it is only read.
-    values
-        Further values, a frequency in Hz. Without any, the result is the run beside as it is, completed; the run itself
-        if there is none.
-    workers, where, echo
-        See `pipeline.runs.run.carry_out`.
-
-    Raises
-    ------
-    SpecError
-        If the run does not sweep one parameter alone.
-    RefusedError
-        If ``NAME-refined`` exists and is another run.
-    """
-    run = RunDirectory.open(source)
-    place = _place_of_further(run)
-    ((key, axis),) = run.spec.axes.items()
-    _finish_exchange(place, echo)
-    own = axis.given()
-    how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
-    more = RATES[run.spec.rate].given(np.array(values)) if key == FREQUENCY else np.array(values)
-    if not is_run(open_files(place)):
-        return _refined(run, np.union1d(own, more), place, (), **how) if len(more) else run
-    old = RunDirectory.open(place)
-    had = old.spec.axes[key].given()
-    if not set(own.tolist()) <= set(had.tolist()) or _but_axes(old.spec) != _but_axes(run.spec):
-        raise RefusedError(f"{place}: exists, and is not {run.name} with further values of {key}; move it away.")
-    if not old.complete:
-        old = _refined(run, had, place, (), **how)
-    wanted = np.union1d(had, more)
-    if len(wanted) == len(had):
-        return old
-    aside = _aside(place)
-    _refined(run, wanted, _beside(place), (old,), **how)
-    _exchange(place, _beside(place), lambda line: None)
-    shutil.rmtree(aside)
-    return RunDirectory.open(place)
-
-
-def _place_of_further(run: RunDirectory) -> Path:
-    """Return the folder of a run's further values; raise SpecError or RefusedError if it can have none."""
-    if len(run.spec.axes) != 1:
-        raise SpecError(
-            f"{run.name}: sweeps {', '.join(run.spec.axes) or 'nothing'}, and further values are those of one swept "
-            "parameter; make a run that sweeps one: magpend zoom."
-        )
-    if run.info.files.local is None:
-        raise RefusedError(f"{run.name}: further values are run in a folder beside it; copy the run to this machine.")
-    folder = run.info.files.local.resolve()
-    return folder.with_name(f"{folder.name}-refined")
-
-
-def _but_axes(spec: Spec) -> Mapping[str, Any]:
-    return {name: table for name, table in spec.as_dict().items() if name != "axes"}
-
-
-def _refined(
-    run: RunDirectory,
-    values: np.ndarray,
-    place: Path,
-    others: Sequence[RunDirectory],
-    *,
-    workers: int | None,
-    where: Where | None,
-    echo: Echo,
-) -> RunDirectory:
-    """Compute a run with other values of its swept parameter in a folder; cells of the run and of others are copied."""
-    from pipeline.compute.clients import Where
-
-    (key,) = run.spec.axes
-    word = run.spec.rate if key == FREQUENCY else key
-    spec = widened(run.spec, Widening({word: {"values": values.tolist()}}))
-    text = derived_toml("Refined", f"run {run.info.name}, digest {run.info.digest}", spec)
-    plan = make_plan(spec, text)
-    files = open_files(place)
-    if is_run(files) and RunDirectory.open(files).info.digest != digest_of(plan.identity):
-        shutil.rmtree(place)  # left by a refinement that was killed
-    fitting, _ = _fitting([*others, run], plan)
-    sources = [(one.info.files.place, one.info.digest) for one in fitting]
-    there = replace(where or Where(), place=files.place)
-    carry_out(plan, files, workers=workers, where=there, echo=echo, sources=sources)
-    return RunDirectory.open(place)
-
-
 # ---- in place ----------------------------------------------------------------------------------
 
 
@@ -410,13 +299,13 @@ def _folder(files: Files) -> Path:
     return files.local
 
 
-def _beside(directory: Path) -> Path:
+def extending_folder(directory: Path) -> Path:
     """Return the folder ``NAME.extending`` in which the wider run is computed, before it replaces the old run."""
     real = directory.resolve()
     return real.with_name(f"{real.name}.extending")
 
 
-def _aside(directory: Path) -> Path:
+def folder_aside(directory: Path) -> Path:
     """Return a path ``NAME.before...`` that does not exist yet, to which the old run is renamed."""
     real = directory.resolve()
     names = (real.with_name(f"{real.name}.before{i}") for i in ("", *(f".{n}" for n in range(2, 10_000))))
@@ -449,9 +338,9 @@ def _refuse_loss(run: RunDirectory, plan: Plan) -> None:
         )
 
 
-def _exchange(directory: Path, built: Path, echo: Echo) -> None:
+def exchange(directory: Path, built: Path, echo: Echo) -> None:
     """Replace a run directory by the finished wider run; the old run is renamed and stays."""
-    real, aside = directory.resolve(), _aside(directory)
+    real, aside = directory.resolve(), folder_aside(directory)
     real.rename(aside)
     sync_folder(real.parent)
     built.rename(real)
@@ -459,9 +348,9 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
     echo(f"the old run is in {aside}; remove it when you no longer need it")
 
 
-def _finish_exchange(directory: Path, echo: Echo) -> None:
+def finish_exchange(directory: Path, echo: Echo) -> None:
     """Finish an interrupted replacement: give the wider run the name of the old run."""
-    built = _beside(directory)
+    built = extending_folder(directory)
     if directory.exists() or not is_run(open_files(built)):
         return
     if not state(built).complete:

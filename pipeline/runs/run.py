@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from magpend_core.models.imported import origin
 from pipeline.layout.conventions import unit_remarks
@@ -131,6 +134,14 @@ def prepare(spec: Spec, files: Files) -> Plan:
     return plan
 
 
+class Work(NamedTuple):
+    """A run to compute: its plan, the files of its directory, and runs whose cells are reused."""
+
+    plan: Plan
+    files: Files
+    sources: Sources = ()
+
+
 def carry_out(
     plan: Plan, files: Files, *, workers: int | None, where: Where, echo: Echo, sources: Sources = ()
 ) -> None:
@@ -154,50 +165,123 @@ def carry_out(
     Exception
         See `run`.
     """
+    carry_out_all([Work(plan, files, sources)], workers=workers, where=where, echo=echo)
+
+
+def carry_out_all(works: Sequence[Work], *, workers: int | None, where: Where, echo: Echo) -> None:
+    """Compute the missing tasks of several runs, as `carry_out` does for one; the workers share the tasks of all."""
     from pipeline.compute import clients
 
-    if check(files, plan.identity) is None:
-        check_space(plan, files.local)
+    new = [work for work in works if check(work.files, work.plan.identity) is None]
+    for work in new:
+        check_space(work.plan, work.files.local)
+    if new:
         clients.reach(where)  # before anything is created
-        _compile(plan, echo)
-    with stoppable(files.name), files.lock() as alone:
-        is_alone = alone is not False
-        info = establish(files, plan, echo, alone=is_alone)
-        commits = sound_commits(info, echo, alone=is_alone)
-        _complete(info, commits, workers, where, echo, sources)
+    for work in new:
+        _compile(work.plan, echo)
+    with stoppable(works[0].files.name), contextlib.ExitStack() as locks:
+        opened = []
+        for work in works:
+            is_alone = locks.enter_context(work.files.lock()) is not False
+            info = establish(work.files, work.plan, echo, alone=is_alone)
+            commits = sound_commits(info, echo, alone=is_alone)
+            missing = [i for i in range(info.plan.n_tasks) if i not in commits]
+            opened.append(_Opened(info, commits, missing, tuple(work.sources)))
+        _complete(opened, workers, where, echo)
 
 
-def _complete(info: RunInfo, commits: Records, workers: int | None, where: Where, echo: Echo, sources: Sources) -> None:
-    """Compute all tasks of a run that are not committed."""
-    from pipeline.compute import clients, execute, task
+@dataclass(frozen=True)
+class _Opened:
+    """A run that is being computed, with the tasks that are committed and those that are missing."""
 
-    plan, packer = info.plan, Packer(info, commits)
-    missing = [i for i in range(plan.n_tasks) if i not in commits]
-    if not missing:
-        write_copy(info, commits)
-        echo(f"{info.name} is complete; nothing to do.")
+    info: RunInfo
+    commits: Records
+    missing: Sequence[int]
+    sources: Sources
+
+    @property
+    def plan(self) -> Plan:
+        return self.info.plan
+
+    @property
+    def n_left(self) -> int:
+        """Number of cells that are not computed."""
+        return sum(self.plan.cells_in(i) for i in self.missing)
+
+    @property
+    def job(self) -> Callable[[int], dict[str, Any]]:
+        """Function that computes a task."""
+        from pipeline.compute import task
+
+        job = partial(task.run_task, self.info.files.place, self.info.digest, origin=origin(self.plan.spec.model))
+        return partial(job, sources=self.sources) if self.sources else job
+
+
+class _Tasks:
+    """Tasks of several runs under one numbering: each run's follow on those of the run before it."""
+
+    def __init__(self, runs: Sequence[_Opened]) -> None:
+        self.runs = runs
+        self.firsts = [0, *accumulate(run.plan.n_tasks for run in runs)][:-1]
+        self.missing = [first + i for first, run in zip(self.firsts, runs, strict=True) for i in run.missing]
+
+    @property
+    def job(self) -> Callable[[int], dict[str, Any]]:
+        """Function that computes a task, given by its number."""
+        from pipeline.compute import task
+
+        return partial(task.run_numbered, tuple(run.job for run in self.runs), tuple(self.firsts))
+
+    def _plan(self, number: int) -> tuple[Plan, int]:
+        """Return the plan of a task, and the number of the first task of this plan."""
+        k = bisect_right(self.firsts, number) - 1
+        return self.runs[k].plan, self.firsts[k]
+
+    def predecessor(self, number: int) -> int | None:
+        """Return the number of the task that a task continues, see `Plan.predecessor`."""
+        plan, first = self._plan(number)
+        before = plan.predecessor(number - first)
+        return None if before is None else first + before
+
+    def seconds(self, number: int) -> float:
+        """Estimate the computing time of a task on one core [s]."""
+        plan, first = self._plan(number)
+        return plan.seconds(number - first)
+
+
+def _complete(opened: Sequence[_Opened], workers: int | None, where: Where, echo: Echo) -> None:
+    """Compute all tasks of some runs that are not committed."""
+    from pipeline.compute import clients, execute
+
+    for run in opened:
+        if not run.missing:
+            write_copy(run.info, run.commits)
+            echo(f"{run.info.name} is complete; nothing to do.")
+    runs = [run for run in opened if run.missing]
+    if not runs:
         return
-    remove_copy(info)
-    before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
-    check_space(plan, info.files.local, plan.n_cells - before)
-    echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
-    for line in start_remarks(plan.spec.initial_conditions):
+    for run in runs:
+        remove_copy(run.info)
+        check_space(run.plan, run.info.files.local, run.n_left)
+    n_cells, n_tasks = sum(run.plan.n_cells for run in runs), sum(run.plan.n_tasks for run in runs)
+    before = n_cells - sum(run.n_left for run in runs)
+    echo(f"{n_cells} cells in {n_tasks} tasks" + (f", {before} cells done before" if before else ""))
+    for line in start_remarks(runs[0].plan.spec.initial_conditions):
         echo(line)
     clients.reach(where)
-    _compile(plan, echo)
-    job = partial(task.run_task, info.files.place, info.digest, origin=origin(plan.spec.model))
-    if sources:
-        job = partial(job, sources=tuple(sources))
+    for run in runs:
+        _compile(run.plan, echo)
+    tasks, packers = _Tasks(runs), [Packer(run.info, run.commits) for run in runs]
     started = time.perf_counter()
-    cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
-    expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
+    cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(tasks.missing)))
+    expected_s = sum(run.plan.core_seconds * run.n_left / run.plan.n_cells for run in runs) / cores
     terminal = sys.stdout.isatty()
-    with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
+    with Progress(n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
         results = execute.run_tasks(
-            job,
-            missing,
-            after=None if plan.path is None else plan.predecessor,
-            seconds=plan.seconds,
+            tasks.job,
+            tasks.missing,
+            after=None if all(run.plan.path is None for run in runs) else tasks.predecessor,
+            seconds=tasks.seconds,
             workers=workers,
             scheduler=where,
             echo=echo,
@@ -205,10 +289,12 @@ def _complete(info: RunInfo, commits: Records, workers: int | None, where: Where
         # closed at once, also by an error or a signal: only then may others use the directory
         with contextlib.closing(results):
             for result in results:
-                log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
-                packer.add(result["task"])
+                k = result.pop("run")
+                log_timing(runs[k].info, {**result, "at_s": round(time.perf_counter() - started, 4)})
+                packers[k].add(result["task"])
                 progress.add(result["cells"])
-    require_all(info, echo)
+    for run in runs:
+        require_all(run.info, echo)
 
 
 def _compile(plan: Plan, echo: Echo) -> None:

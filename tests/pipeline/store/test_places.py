@@ -342,7 +342,7 @@ def test_run__ends_only_if_every_task_is_committed_here(place, main, monkeypatch
     original = execute.run_tasks
 
     def elsewhere(job, indices, **options):
-        yield from ({"task": i, "cells": 1} for i in indices)
+        yield from ({"run": 0, "task": i, "cells": 1} for i in indices)
 
     def losing(job, indices, **options):
         yield from original(job, indices, **options)

@@ -13,7 +13,7 @@ from magpend._runs import shown
 from pipeline.analysis.events import analysis
 from pipeline.cli.main import app
 from pipeline.report.report import part_of
-from pipeline.runs import extend as extending
+from pipeline.runs import beside as refining
 from pipeline.store.errors import RefusedError
 
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mirror={"signs": {"x": -1}}, mu=0.5)
@@ -183,7 +183,7 @@ def test_refine__goes_on_after_a_kill(tmp_path, monkeypatch, undecided):
     whole = logistic(tmp_path / "whole")
     whole.events(refine=WIDTH, workers=0)
     run = logistic(tmp_path / "killed")
-    original = {name: getattr(extending, name) for name in ("carry_out", "_exchange")}
+    original = {name: getattr(refining, name) for name in ("carry_out", "exchange")}
     rename, place = Path.rename, tmp_path / "killed" / "run-refined"
 
     def stop(*words, **options):
@@ -198,8 +198,8 @@ def test_refine__goes_on_after_a_kill(tmp_path, monkeypatch, undecided):
             raise Killed
         return rename(self, target)
 
-    kills = [(extending, "carry_out", stop), (extending, "carry_out", stop_afterwards)]
-    kills += [(extending, "carry_out", stop), (extending, "carry_out", stop_afterwards), (extending, "_exchange", stop)]
+    kills = [(refining, "carry_out", stop), (refining, "carry_out", stop_afterwards)]
+    kills += [(refining, "carry_out", stop), (refining, "carry_out", stop_afterwards), (refining, "exchange", stop)]
     kills += [(Path, "rename", half_exchange)]
     for n, (owner, name, replacement) in enumerate(kills):
         monkeypatch.setattr(owner, name, replacement)
