@@ -63,7 +63,12 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
 
 
 def attracting(
-    attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
+    attractors: xr.Dataset,
+    parameters: Parameters,
+    parameter: str,
+    interval: tuple[float, float],
+    max_period: int = 0,
+    scale: float | None = None,
 ) -> tuple[list[Start], list[str]]:
     """Return the starting orbits of branches from a run's attractors, and a text line for each attractor left out.
 
@@ -76,9 +81,11 @@ def attracting(
     parameter
         Parameter to continue.
     interval
-        Interval of the parameter; its length counts as 1.
+        Interval of the parameter.
     max_period
         Longest period taken [drive periods]; 0 takes all.
+    scale
+        Change of the parameter that counts as 1; by default the length of the interval.
 
     Returns
     -------
@@ -90,7 +97,7 @@ def attracting(
     (low, high), word = interval, rate_of(attractors)
     starts: list[Start] = []
     reasons: dict[tuple[int, str], list[Mapping[str, float]]] = {}
-    for one in listed(attractors, parameters, parameter, high - low):
+    for one in listed(attractors, parameters, parameter, high - low if scale is None else scale):
         why = _why_not(one, interval, max_period, word)
         if why:
             reasons.setdefault((one.identity, why), []).append(one.where)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pkgutil import resolve_name
 
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.intervals import interval_along, settle_along, swept_axis
 from pipeline.analysis.branches.kinds import FOLD, KINDS, SNIC
@@ -50,7 +51,7 @@ from pipeline.layout.vocabulary import (
     parameters_of,
 )
 from pipeline.layout.vocabulary import KINDS as SETS
-from pipeline.products.reporting import track
+from pipeline.products.reporting import silent, track
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import isel, points_of_rows, rows_at
 from pipeline.results.run import OpenRun
@@ -94,22 +95,55 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     low, high = interval_along(run, options.parameter)
     inside = (part[axis].values >= low) & (part[axis].values <= high)
     part = isel(part, {axis: np.flatnonzero(inside)})
-    base, geometry = parameters_of(run.cube()), geometry_of(found)
+    length = float(np.ptp(part[axis].values))
+    return ends_of(part, located, axis, parameters_of(run.cube()), length, orbits=options.orbits, echo=run.echo)
+
+
+def ends_of(
+    part: xr.Dataset,
+    located: xr.Dataset,
+    axis: str,
+    base: Parameters,
+    scale: float,
+    *,
+    orbits: bool = False,
+    echo: Callable[[str], None] = silent,
+) -> xr.Dataset:
+    """Name the events at the ends of attractors along one axis, given the branches there.
+
+    Parameters
+    ----------
+    part
+        Attractors along the axis, at one value of each other parameter, with plain names.
+    located
+        From `pipeline.analysis.branches.dataset.dataset_of`, along the same parameter.
+    axis
+        Name of the axis.
+    base
+        Parameters of the run, apart from those on its axes.
+    scale
+        Length of the axis that the run sweeps: errors of located bifurcations are at least a share of it.
+    orbits
+        Whether to leave the ends of chaotic sets and tori undecided.
+    echo
+        Function that prints a line.
+    """
+    geometry = geometry_of(part)
     others = base.as_dict() | {parameter_name(str(k)): float(v) for k, v in part.coords.items() if not v.ndim}
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
-    scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
+    scene = Scene(part, located, axis, base, order, scale, lines_of(located, others, geometry))
     stretches, ids = _continued(scene, [_undoubled(scene, one) for one in _stretches(scene)])
-    if not options.orbits:
+    if not orbits:
         stretches = Crises(replace(scene, names=ids)).split(stretches)
-    run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
+    echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(*_cut(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
     named = [_on_circle(scene, one, named) for one in named]
-    if not options.orbits:
+    if not orbits:
         named = [_aperiodic(scene, one, named) for one in track(named, "naming ends of attractors")]
     return dataset_of(scene, stretches, _merged(with_images(scene, named)))
 

@@ -249,6 +249,7 @@ def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geom
     step, factor = saddle.turn(n_bands)
     with np.errstate(invalid="ignore"):
         near = np.array([geometry.distance(paths, x) < 2.0 * reach for x in saddle.points])
+    turned = _followed(near)
     found = {}
     for k in range(saddle.period):
         lane, time = np.nonzero(near[k])
@@ -256,16 +257,17 @@ def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geom
         along = offset @ saddle.covectors[k]
         beside = np.abs(offset - along[:, None] * saddle.directions[k]).max(axis=-1)
         away = np.maximum(np.abs(along), beside)
-        order = np.lexsort((time, time % step, lane))
-        order = order[away[order] < reach]
+        order = np.flatnonzero(away < reach)  # by trajectory and time
+        order = order[np.argsort(lane[order] * step + time[order] % step, kind="stable")]
         along, away, lane, time = along[order], away[order], lane[order], time[order]
         if not len(lane):
             continue
         begins = np.append(True, (np.diff(lane) != 0) | (np.diff(time) != step))
-        for i in range(1, step):  # it has left, and come back by chance, if it does not follow the orbit in between
-            begins |= ~near[(k - i) % saddle.period, lane, time - i]
+        # it has left, and come back by chance, if it does not follow the orbit in between
+        begins |= turned[(k - time) % saddle.period, lane, time] < step
         number = np.cumsum(begins) - 1
-        closest = np.lexsort((away, number))[np.flatnonzero(begins)]
+        nearest = np.flatnonzero(away == np.minimum.reduceat(away, np.flatnonzero(begins))[number])
+        closest = nearest[np.diff(number[nearest], prepend=-1) > 0]
         first, turns = time[begins], np.bincount(number)
         gone = (time[closest] - first) // step
         with np.errstate(over="ignore"):
@@ -278,6 +280,28 @@ def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geom
             own = time[closest] % step == phase
             found[k, phase] = clearance[own], lane[closest][own], time[closest][own]
     return found
+
+
+def _followed(near: np.ndarray) -> np.ndarray:
+    """Count the sections up to each one in which a trajectory follows an orbit point by point.
+
+    Parameters
+    ----------
+    near
+        Whether each point of the orbit is near at each section, shape (point, trajectory, time).
+
+    Returns
+    -------
+    ndarray
+        Counts, shape (phase, trajectory, time); the phase is the orbit's point at time 0.
+    """
+    period, _, n = near.shape
+    time = np.arange(n, dtype=np.int32)
+    left = np.empty(near.shape, np.int32)  # last section at which the point of the phase was not near
+    for phase in range(period):
+        here = near[(phase + time) % period, :, time].T
+        np.maximum.accumulate(np.where(here, np.int32(-1), time), axis=1, out=left[phase])
+    return np.asarray(time - left)
 
 
 @dataclass(frozen=True)

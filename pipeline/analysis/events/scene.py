@@ -82,6 +82,7 @@ class Scene:
     axis: str
     base: Parameters
     order: np.ndarray  # positions on the axis by rising value
+    scale: float  # length of the whole axis
     lines: Sequence[Line]
     names: Mapping[tuple[int, int], int] = field(default_factory=dict)  # ids of joined attractors, by place and id
     verdicts: dict[Any, Any] = field(default_factory=dict)  # of detectors that look at several ends at once
@@ -90,11 +91,6 @@ class Scene:
     def along(self) -> np.ndarray:
         """Values of the axis in rising order."""
         return np.asarray(self.attractors[self.axis].values[self.order], np.float64)
-
-    @property
-    def scale(self) -> float:
-        """Length of the axis."""
-        return float(np.ptp(self.along))
 
     def values_at(self, one: Event) -> tuple[float, float]:
         """Return the next value beyond an end, and the last one before it."""

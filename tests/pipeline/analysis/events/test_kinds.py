@@ -43,7 +43,7 @@ def scene() -> Scene:
     found = xr.Dataset(variables, {"amplitude": list(ALONG)}, {**DUFFING, N_IDS: 2})
     located = xr.Dataset(attrs={**DUFFING, "parameter": "amplitude", "parameter_units": "m"})
     base = load_model("duffing").load("twin-well")
-    return Scene(found, located, "amplitude", base, np.arange(4), [])
+    return Scene(found, located, "amplitude", base, np.arange(4), 3.0, [])
 
 
 def events_of(one: Scene) -> xr.Dataset:
