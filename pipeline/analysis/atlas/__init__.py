@@ -1,0 +1,1 @@
+"""Chart a plane of two parameters: regions, curves, and what neither explains."""
