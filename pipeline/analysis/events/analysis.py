@@ -107,6 +107,7 @@ def ends_of(
     scale: float,
     *,
     orbits: bool = False,
+    between: tuple[float, float] | None = None,
     echo: Callable[[str], None] = silent,
 ) -> xr.Dataset:
     """Name the events at the ends of attractors along one axis, given the branches there.
@@ -125,6 +126,8 @@ def ends_of(
         Length of the axis that the run sweeps: errors of located bifurcations are at least a share of it.
     orbits
         Whether to leave the ends of chaotic sets and tori undecided.
+    between
+        Neighbouring values between which the ends of chaotic sets and tori are decided; None: between all.
     echo
         Function that prints a line.
     """
@@ -132,7 +135,7 @@ def ends_of(
     others = base.as_dict() | {parameter_name(str(k)): float(v) for k, v in part.coords.items() if not v.ndim}
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
-    scene = Scene(part, located, axis, base, order, scale, lines_of(located, others, geometry))
+    scene = Scene(part, located, axis, base, order, scale, lines_of(located, others, geometry), between=between)
     stretches, ids = _continued(scene, [_undoubled(scene, one) for one in _stretches(scene)])
     if not orbits:
         stretches = Crises(replace(scene, names=ids)).split(stretches)
@@ -421,7 +424,8 @@ def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
     """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by what happens
     between the two values, if there is proof.
     """
-    if one.what != UNDECIDED or one.stretch.kind not in (TORUS, CHAOTIC_SET):
+    is_open = one.what == UNDECIDED and one.stretch.kind in (TORUS, CHAOTIC_SET)
+    if not is_open or not scene.is_asked(one.place, one.way):
         return one
     if orbit_beyond(one, named) is None:
         one = replace(one, fate=replace(one.fate, why=_why_open(one, named)))

@@ -122,7 +122,8 @@ class Crises:
                     (self._joined, place, 1),
                     (self._joined, place + 1, -1),
                 )
-                if not any(crisis(one.attractor, k, way).what for crisis, k, way in tries):
+                is_asked = self.scene.is_asked(place, 1)
+                if not is_asked or not any(crisis(one.attractor, k, way).what for crisis, k, way in tries):
                     continue
                 left, right = self._row(one.attractor, place), self._row(one.attractor, place + 1)
                 last = parts.pop()

@@ -86,11 +86,16 @@ class Scene:
     lines: Sequence[Line]
     names: Mapping[tuple[int, int], int] = field(default_factory=dict)  # ids of joined attractors, by place and id
     verdicts: dict[Any, Any] = field(default_factory=dict)  # of detectors that look at several ends at once
+    between: tuple[float, float] | None = None  # neighbouring values between which ends of sets are decided; None: all
 
     @property
     def along(self) -> np.ndarray:
         """Values of the axis in rising order."""
         return np.asarray(self.attractors[self.axis].values[self.order], np.float64)
+
+    def is_asked(self, place: int, way: int) -> bool:
+        """Return whether ends of chaotic sets and tori between a place and the next one are to be decided."""
+        return self.between is None or {*self.along[[place, place + way]].tolist()} == {*self.between}
 
     def values_at(self, one: Event) -> tuple[float, float]:
         """Return the next value beyond an end, and the last one before it."""

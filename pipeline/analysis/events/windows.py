@@ -22,6 +22,7 @@ def events_within(
     base: Parameters,
     scale: float,
     max_period: int = 0,
+    between: tuple[float, float] | None = None,
     echo: Callable[[str], None] = silent,
 ) -> xr.Dataset:
     """Name the events of attractors at a few neighbouring values of a parameter.
@@ -39,6 +40,8 @@ def events_within(
         Length of the whole axis, which counts as 1: steps along branches, and least errors, are shares of it.
     max_period
         Longest period of branches; 0: that with three doublings of the longest orbit in the window.
+    between
+        Two neighbouring values in the window: only ends of chaotic sets and tori between them are decided. None: all.
     echo
         Function that prints a line.
 
@@ -53,4 +56,4 @@ def events_within(
     starts, left_out = attracting(part, base, axis, (low, high), max_period, scale)
     longest = max_period or doubled * max([1, *(start.family.period for start in starts)])
     located = dataset_of(explore(starts, Scope(low, high, longest)), axis, base, left_out, rate_of(part))
-    return ends_of(part, located, axis, base, scale, echo=echo)
+    return ends_of(part, located, axis, base, scale, between=between, echo=echo)

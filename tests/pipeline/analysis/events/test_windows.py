@@ -32,12 +32,12 @@ def run(tmp_path_factory):
     return AnalysedRun.of(folder)
 
 
-def within(run, K, first, n=2):
+def within(run, K, first, n=2, between=None):
     """Return the decided ends in a window of the row at K."""
     found, k = run.derive("attractors"), ALONG.index(first)
     part = choose(found, {"K": K}, ("r", *start_dims(found)), "a row of the plane")
     part = isel(part, {"r": slice(k, k + n)})
-    return decided(events_within(part, "r", parameters_of(run.cube()), ALONG[-1] - ALONG[0]))
+    return decided(events_within(part, "r", parameters_of(run.cube()), ALONG[-1] - ALONG[0], between=between))
 
 
 def decided(ds):
@@ -60,6 +60,12 @@ def test_events_within__orbits_alone(run):
     found = within(run, 1.0, 3.5)
     assert set(found) == {("period_doubling", 3.5, 3.56), ("period_doubling", 3.56, 3.5)}
     assert all(abs(value - 3.544090359) <= error + 1e-9 < 1e-8 for value, error in found.values())
+
+
+def test_events_within__decides_between_two_values_alone(run):
+    found = within(run, 1.0, 3.69, 3, between=(3.82, 3.83))
+    assert set(found) == {("intermittency_i", 3.82, 3.83), ("fold", 3.83, 3.82)}
+    assert set(within(run, 1.0, 3.69, 3, between=(3.69, 3.82))) == {("fold", 3.83, 3.82)}
 
 
 @pytest.mark.slow
