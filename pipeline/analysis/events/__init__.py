@@ -7,7 +7,7 @@ branch gives no reason, the event is not decided. `analysis` joins attractors an
 `kinds` lists: `cascades`, `passages`, `breakups` and `crises` decide ends of chaotic sets and tori, `crises` by what
 `contact`, `connections` and `transients` measure; `grazing` decides those of orbits that touch a surface. `one_event`
 finds the ends that are one event; `dataset` has the Dataset, `sentences` the table. `windows` does the same at a few
-neighbouring values, with branches there alone.
+neighbouring values, with branches near them alone.
 
 Ids that lie on one stable piece of a branch are one attractor and have the least of their ids, since ids of
 equilibria rest on distance alone. Nothing is looked for between neighbouring values at which cells end on the same

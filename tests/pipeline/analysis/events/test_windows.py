@@ -15,7 +15,7 @@ from pipeline.runs.derive import AnalysedRun
 
 LOGISTIC = magpend.model("x' = r*x*(1 - x/K)", name="logistic", kind="map", r=3.2, K=1.0)
 """K is the unit of x: bifurcations by r do not depend on it."""
-ALONG = (3.4, 3.5, 3.56, 3.57, 3.66, 3.69, 3.82, 3.83)
+ALONG = (3.4, 3.5, 3.56, 3.5713, 3.66, 3.69, 3.82, 3.83)
 MERGING = float(np.roots([1.0, -2.0, -4.0, -8.0])[0].real)
 """Two bands merge where the third iterate of the middle is the fixed point."""
 
@@ -37,7 +37,7 @@ def within(run, K, first, n=2, between=None):
     found, k = run.derive("attractors"), ALONG.index(first)
     part = choose(found, {"K": K}, ("r", *start_dims(found)), "a row of the plane")
     part = isel(part, {"r": slice(k, k + n)})
-    return decided(events_within(part, "r", parameters_of(run.cube()), ALONG[-1] - ALONG[0], between=between))
+    return decided(events_within(part, "r", parameters_of(run.cube()), (ALONG[0], ALONG[-1]), between=between))
 
 
 def decided(ds):
