@@ -88,6 +88,7 @@ _OWN: dict[str, dict[str, Line]] = {
         "bands": Line(_room("branches"), "a posterior of magpend identify"),
         "sensitivities": Line(_room("branches"), "", ""),
         "curves": Line(_room("branches"), "", ""),
+        "atlas": Line(_room("atlas"), f"a sweep over {_TWO}", f"a sweep over {_TWO}"),
         "orbits": Line(_room("branches"), _POINT),
         "rotation": Line(_room("branches"), None, f"{_ROTATION}, and {_ONE}, or {_TWO}"),
         "tongues": Line(_room("branches"), _ROTATION, f"{_ROTATION}, and {_ONE}"),
@@ -181,7 +182,9 @@ class Registry(Mapping[str, P]):
 
 
 _CELLS_OWN: Groups = {"": {n: (f"pipeline.products.{n}:{n.upper()}", "") for n in ("lyapunov", "extremes", "rotation")}}
-_FOR_OTHERS: Groups = {"": {"identified": (f"{_room('attractors')}:IDENTIFIED", "")}}
+_FOR_OTHERS: Groups = {
+    "": {"identified": (f"{_room('attractors')}:IDENTIFIED", ""), "orbit_ends": (f"{_room('atlas')}:ORBIT_ENDS", "")}
+}
 
 CELL_PRODUCTS: Registry[CellProduct] = Registry(lambda: _CELLS_OWN)
 ANALYSES: Registry[Analysis] = Registry(lambda: {**_groups("analysis"), **_FOR_OTHERS})

@@ -31,7 +31,7 @@ def named(run: RunDirectory, options: Options) -> Options:
     ``at`` accepts ``frequency``, ``frequency_hz``, ``omega`` or ``period`` of the drive, a parameter, and for a grid
     of initial states its axis ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second``
     accept these names, too; bounds are then in their unit. ``start`` accepts the parameter in any of its words. An
-    empty ``parameter`` stands for the swept one, an empty ``state`` for the first state that varies between sections.
+    empty ``parameter`` stands for the swept one, an empty ``second`` for the other one of two, an empty ``state`` for the first state that varies between sections.
 
     Raises
     ------
@@ -52,6 +52,8 @@ def named(run: RunDirectory, options: Options) -> Options:
     model = run.model
     if {"parameter", "second", "state"} & fields.keys():
         is_left_out = {role: given.get(role) == "" for role in _BOUNDS}
+        if given.get("second") == "":
+            given |= _plane(run, given["parameter"], given.get("at", {}))
         if given.get("parameter") == "":
             given["parameter"] = _swept(run, [given.get("second", ""), *given.get("at", {})])
         for role in {"parameter", "second"} & fields.keys():
@@ -137,9 +139,7 @@ def _swept(run: RunDirectory, others: Iterable[str]) -> str:
     """Return the one parameter that a run sweeps besides `others`, or the drive frequency if it sweeps none; raise
     SpecError if it sweeps several.
     """
-    cube = run.cube()
-    swept = [name for name in run.spec.axes if cube.sizes.get(axis_name(name), 1) > 1]
-    swept = [name for name in swept if axis_name(name) not in map(axis_name, others)]
+    swept = _all_swept(run, others)
     if len(swept) > 1:
         raise SpecError(
             f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
@@ -153,6 +153,27 @@ def _swept(run: RunDirectory, others: Iterable[str]) -> str:
         f"{run.name} sweeps no parameter, and {run.model.name} has no drive frequency to follow; give "
         f"--parameter: {known}."
     )
+
+
+def _all_swept(run: RunDirectory, others: Iterable[str]) -> list[str]:
+    cube = run.cube()
+    swept = [name for name in run.spec.axes if cube.sizes.get(axis_name(name), 1) > 1]
+    return [name for name in swept if axis_name(name) not in map(axis_name, others)]
+
+
+def _plane(run: RunDirectory, first: str, at: Iterable[str]) -> dict[str, str]:
+    """Return the two parameters of a plane, the first as it is given or else the run's first axis; raise SpecError if
+    the run does not sweep two.
+    """
+    swept = _all_swept(run, at)
+    if len(swept) < 2 or "branch" in run.cube().dims:
+        raise SpecError(
+            "a plane needs a sweep over two parameters, each with several values: "
+            f"{run.name} {'is a continuation of' if 'branch' in run.cube().dims else 'sweeps'} "
+            f"{', '.join(swept) or 'none'}."
+        )
+    first = first or swept[0]
+    return {"parameter": first, "second": next(name for name in swept if axis_name(name) != axis_name(first))}
 
 
 def _unknown(what: str, given: str, name: str, known: Iterable[str], rate: str = FREQUENCY) -> list[str]:

@@ -196,19 +196,20 @@ def continue_curves(
     max_period: int = 0,
     generations: int = 3,
     left_out: dict[int, str] | None = None,
+    known: Sequence[Curve] = (),
 ) -> list[Curve]:
     """Follow each bifurcation in both directions in the parameter plane, until a bound, its own start or a resonance.
 
     Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`. Starts
-    without a curve go to `left_out`, with the reason.
+    without a curve go to `left_out`, with the reason. No curve of `known` is followed again, nor are those returned.
     """
     left_out = {} if left_out is None else left_out
     problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
     firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)], FIRST)
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     left_out |= {s[0]: LOST for s, f in zip(starts, firsts, strict=True) if f is None}
-    curves: list[Curve] = []
-    seen: list[SpecialPoint] = []
+    curves = list(known)
+    seen = merged({i: curve.special for i, curve in enumerate(curves)})
     for generation in range(1 + generations):
         what = f"following curves{f' that spring from others, round {generation}' if generation else ''}"
         _follow_all(ready, curves, bounds, settings, left_out, what)
@@ -219,7 +220,7 @@ def continue_curves(
         ready = [(-1, *pair) for pair in run_together(sprung, FIRST) if pair is not None]
         if not ready:
             break
-    return curves
+    return curves[len(known) :]
 
 
 CurveProblem = BifurcationProblem | EquilibriumCurve

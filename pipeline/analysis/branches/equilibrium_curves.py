@@ -112,7 +112,8 @@ class EquilibriumCurve(FamilyProblem):
         if not (np.isfinite(rates[0]).all() and np.isfinite(jacobians[0]).all()):
             nothing = np.full((size - 1, size), np.nan)
             return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobians[0], is_rest=True)
-        matrices = self.family.scaled(jacobians) * self._unit_of(jacobians[0])
+        slopes = (rates[1 : 1 + size] - rates[1 + size :])[n:] / (2.0 * PARAMETER_STEP)
+        matrices = self.family.scaled(jacobians) * self._unit_of(jacobians[0], slopes)
         found = self._equations(places, rates * self.unit, matrices)
         derivative = (found[1 : 1 + size] - found[1 + size :]).T / (2.0 * steps)
         derivative[:n, :n] = matrices[0]
@@ -127,12 +128,15 @@ class EquilibriumCurve(FamilyProblem):
         rates, jacobians = plain_rates(system, rows.states, rows.parameters)
         return rates / np.asarray(system.scales), jacobians
 
-    def _unit_of(self, jacobian: np.ndarray) -> float:
+    def _unit_of(self, jacobian: np.ndarray, slopes: np.ndarray = np.zeros(0)) -> float:
         """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
-        call.
+        call. A Jacobian of one state vanishes at a fold, so that the slopes by the parameters count with it.
         """
         if not self.unit:
-            self.unit = 1.0 / (float(np.linalg.norm(self.family.scaled(jacobian))) or 1.0)
+            size = float(np.linalg.norm(self.family.scaled(jacobian)))
+            if len(jacobian) == 1:
+                size = max(size, float(np.linalg.norm(slopes)))
+            self.unit = 1.0 / (size or 1.0)
         return self.unit
 
     def _equations(self, places: np.ndarray, rates: np.ndarray, matrices: np.ndarray) -> np.ndarray:

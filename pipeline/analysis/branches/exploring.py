@@ -192,7 +192,7 @@ def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
 
 
 def _both_ways(starts: Sequence[Start], doubled: _Doubled, what: str) -> list[Branch | None]:
-    firsts = run_together([_first(start, doubled.scope.settings) for start in starts])
+    firsts = run_together([first_of(start, doubled.scope.settings) for start in starts])
     pairs = [pair for pair in firsts if pair is not None]
     halves = run_together(
         [doubled.half(family, way) for family, point in pairs for way in (opposite(point), point)],
@@ -203,7 +203,7 @@ def _both_ways(starts: Sequence[Start], doubled: _Doubled, what: str) -> list[Br
     return [None if pair is None else next(found) for pair in firsts]
 
 
-def _first(start: Start, settings: Settings) -> Steps[tuple[Family, Point] | None]:
+def first_of(start: Start, settings: Settings) -> Steps[tuple[Family, Point] | None]:
     """Return the first point of a branch and the family of its least period; None if Newton's method fails.
 
     At a period doubling a starting orbit of twice the period may be the single one but for its error.

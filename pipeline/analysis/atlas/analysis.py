@@ -1,0 +1,252 @@
+"""Define the atlas of a run that sweeps two parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.atlas.charting import Chart, Located, charted, others_unstable
+from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions
+from pipeline.analysis.atlas.effects import Effect, effects_of
+from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End, follow_all
+from pipeline.analysis.atlas.lines import Key, Line, lines_through
+from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, plane_of
+from pipeline.analysis.atlas.regions import variables_of_regions
+from pipeline.analysis.atlas.verdicts import Verdict, verdicts
+from pipeline.analysis.branches.curves import curves_dataset
+from pipeline.analysis.branches.intervals import in_words, swept_axis
+from pipeline.analysis.branches.kinds import HOMOCLINIC, KINDS, SNIC
+from pipeline.analysis.branches.problems import FREQUENCY, Family
+from pipeline.analysis.branches.starting_orbits import listed, parameters_at
+from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, UNDECIDED
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import APERIODIC, axis_name, parameters_of
+from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.results.ragged import ROW_SIZE, SET, padded
+from pipeline.results.run import OpenRun
+from pipeline.specification.problems import SpecError
+
+Given = TypeVar("Given", bound=PlaneOptions)
+
+WHATS = (*EVENTS, GOES_ON, SHRINKS, TOUCHES)
+"""What explains a change, in the order of the codes in results."""
+
+MARGIN = 0.06
+"""Width beyond the plane up to which curves are followed, in units of the plane: more than their longest step."""
+
+
+# ---- options -----------------------------------------------------------------------------------
+
+
+def settle_plane(run: OpenRun, options: Given) -> Given:
+    """Return the options; raise SpecError unless the run is a sweep over both parameters."""
+    names = options.parameter, options.second
+    for name in names:
+        if "branch" in run.cube().dims or swept_axis(run, name) is None:
+            raise SpecError(
+                f"an atlas needs a sweep over two parameters, and this run does not sweep {in_words(run, name)}: [axes]."
+            )
+    if axis_name(names[0]) == axis_name(names[1]):
+        raise SpecError(f"--parameter and --second are both {in_words(run, names[0])}; give two parameters.")
+    return options
+
+
+def _plane(run: OpenRun, options: PlaneOptions) -> Plane:
+    return plane_of(run.derive("attractors"), (axis_name(options.parameter), axis_name(options.second)), options.at)
+
+
+# ---- ends of orbits ----------------------------------------------------------------------------
+
+
+def ways(run: OpenRun, options: PlaneOptions) -> list[list[float]]:
+    """List the orbits to follow: the row of each, the parameter along which (0 or 1), and up to which value."""
+    plane = _plane(run, options)
+    return [list(way) for way in _ways(plane, changes_of(plane))]
+
+
+def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float]]:
+    kinds = plane.sets["kind"].values
+    found = []
+    for one in changes:
+        axis = plane.axis_of(one.edge)
+        for row, node in ((one.row, one.there), (one.other, one.here)):
+            if row >= 0 and kinds[row] not in APERIODIC:
+                found.append((row, axis, float(plane.values[node, axis])))
+    return found
+
+
+def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[float]]) -> xr.Dataset:
+    """Follow orbits that a neighbouring point lacks towards that point."""
+    plane = _plane(run, options)
+    base, n = parameters_of(run.cube()), len(run.model.state_names)
+    ends = [End(UNDECIDED, why="Newton's method found no orbit there")] * len(wanted)
+    rows = np.array([int(one[0]) for one in wanted], int)
+    for axis, name in enumerate(plane.names):
+        own = [k for k, one in enumerate(wanted) if one[1] == axis]
+        there = np.zeros(plane.sets.sizes[SET], bool)
+        there[rows[own]] = True
+        found = listed(plane.sets, base, name, float(plane.size[axis]), there)
+        start = dict(zip(np.flatnonzero(there).tolist(), (one.start for one in found), strict=True))
+        asked = [(k, one, float(wanted[k][2])) for k in own if (one := start[int(rows[k])]) is not None]
+        for (k, _, _), end in zip(asked, follow_all([way[1:] for way in asked]), strict=True):
+            ends[k] = end
+    node = dict(zip(plane.rows.tolist(), plane.node.tolist(), strict=True))
+    places = plane.values[[node[row] for row in rows.tolist()]].copy()
+    for k, (one, end) in enumerate(zip(wanted, ends, strict=True)):
+        places[k, int(one[1])] = end.value
+    empty = np.full(n, np.nan)
+    variables: dict[str, Any] = {
+        "set_row": ("end", rows.astype(np.int32)),
+        "axis": ("end", np.array([int(one[1]) for one in wanted], np.int8)),
+        "what": ("end", np.array([WHATS.index(end.what) for end in ends], np.int8), code_flags(WHATS)),
+        "end_period": ("end", np.array([end.period for end in ends], np.int32)),
+        "end_first": ("end", places[:, 0]),
+        "end_second": ("end", places[:, 1]),
+        "end_error": ("end", [e.error / plane.size[int(w[1])] for w, e in zip(wanted, ends, strict=True)]),
+        "end_section": (("end", "state"), np.array([empty if e.state is None else e.state for e in ends])),
+        "why": ("end", np.array([end.why for end in ends], object)),
+    }
+    attrs = {"first_parameter": plane.names[0], "second_parameter": plane.names[1]}
+    return xr.Dataset(variables, {"state": list(run.model.state_names)}, attrs)
+
+
+# ---- the atlas ---------------------------------------------------------------------------------
+
+
+def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
+    """Chart the plane of two parameters of a run, and hold its curves against its attractors.
+
+    Returns
+    -------
+    Dataset
+        The curves as of the analysis ``curves``, with what each does to attractors; ``line`` for ends that lie side by
+        side but on no curve; ``change`` for each attractor that a neighbouring point lacks, with what explains it;
+        ``region``, ``member`` (attractors of regions), ``border`` and ``ring``.
+    """
+    plane = _plane(run, options)
+    changes = changes_of(plane)
+    run.echo(f"atlas: {len(changes)} changes between {len(plane.edges)} pairs of neighbouring points")
+    ends = run.derive("orbit_ends", **options.part(PlaneOptions))
+    kinds = plane.sets["kind"].values
+    count = iter(range(ends.sizes["end"]))
+    numbers = [
+        [next(count) for row in (one.row, one.other) if row >= 0 and kinds[row] not in APERIODIC] for one in changes
+    ]
+    found = verdicts(plane, changes, numbers, ends, run.model.system)
+    chart = _charted(run, options, plane, changes, found)
+    lines = _lines(plane, changes, found)
+    curves = curves_dataset(chart.curves, *plane.names, run.model)
+    tracks = [plane.scaled(np.array([c.family.values(p.u) for p in c.points])) for c in chart.curves]
+    others = [others_unstable(curve) for curve in chart.curves]
+    told = effects_of(plane, changes, found, chart.curves, tracks, [one == 0 for one in others])
+    variables = {**_of_curves(curves, others, told), **_of_lines(lines), **_of_changes(plane, changes, found)}
+    variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines)
+    return curves.assign(variables)
+
+
+def _family(run: OpenRun, plane: Plane, period: int) -> Family:
+    """Return the family of orbits of a period, or of equilibria, with both parameters of the plane free."""
+    corner = plane.sets[[ROW_SIZE]].isel(dict.fromkeys(plane.names, 0))
+    frequency, packed = parameters_at(corner, parameters_of(run.cube()))
+    scales = (float(plane.size[0]), float(plane.size[1]))
+    return Family(run.model.system, period, frequency, packed, plane.names, scales)
+
+
+def _charted(
+    run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]
+) -> Chart:
+    """Continue the located bifurcations, and give each change the curve on which it lies."""
+    own = [k for k, one in enumerate(found) if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None]
+    numbers = plane.sets["attractor"].values
+    families = {period: _family(run, plane, period) for period in {0, *(found[k].period for k in own)}}
+    located = [
+        Located(
+            families[0 if one.what in (HOMOCLINIC, SNIC) else one.period],
+            one.what,
+            int(numbers[change.row]),
+            np.asarray(one.state),
+            one.place,
+            one.error if one.error > 1e-6 else 0.0,
+        )
+        for one, change in ((found[k], changes[k]) for k in own)
+    ]
+    margin = MARGIN * plane.size
+    low, high = plane.low - margin, plane.low + plane.size + margin
+    for axis, name in enumerate(plane.names):
+        if name == FREQUENCY:
+            low[axis] = max(low[axis], 0.5 * plane.low[axis])
+    bounds = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+    longest = options.curve_period or int(plane.sets["orbit_period"].values[plane.rows].max(initial=1))
+    chart = charted(located, bounds, longest)
+    for k, curve in zip(own, chart.curve_of.tolist(), strict=True):
+        found[k].curve = curve
+    return chart
+
+
+def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> list[Line]:
+    """Join the changes that lie on no curve, and give each its line."""
+    own = [k for k, one in enumerate(found) if one.curve < 0 and one.is_seen and one.what != LIVES_ON]
+    kinds = plane.sets["kind"].values
+    items: list[tuple[int, Key, Array]] = [
+        (changes[k].edge, (found[k].what, found[k].period, int(kinds[changes[k].row])), found[k].place) for k in own
+    ]
+    lines = lines_through(plane, items)
+    for number, line in enumerate(lines):
+        for item in line.items:
+            found[own[item]].line = number
+    return lines
+
+
+# ---- variables ---------------------------------------------------------------------------------
+
+
+def _of_curves(curves: xr.Dataset, others: Sequence[Array], told: Sequence[Effect]) -> dict[str, Any]:
+    unstable = np.full((curves.sizes["curve"], curves.sizes["point"]), -1, np.int8)
+    for one, row in zip(others, unstable, strict=True):
+        row[: len(one)] = one
+    return {
+        "others_unstable": (("curve", "point"), unstable),
+        "n_crossed": ("curve", np.array([one.n_crossed for one in told], np.int32)),
+        "n_effects": ("curve", np.array([one.n_effects for one in told], np.int32)),
+        "effect": ("curve", np.array([one.why for one in told], object)),
+    }
+
+
+def _of_lines(lines: Sequence[Line]) -> dict[str, Any]:
+    places = padded([line.places for line in lines], 2)
+    return {
+        "line_what": ("line", np.array([WHATS.index(line.what) for line in lines], np.int8), code_flags(WHATS)),
+        "line_period": ("line", np.array([line.period for line in lines], np.int32)),
+        "line_size": ("line", np.array([len(line.places) for line in lines], np.int32)),
+        "n_tested": ("line", np.array([len(line.places) for line in lines], np.int32)),
+        "line_first": (("line", "vertex"), places[..., 0]),
+        "line_second": (("line", "vertex"), places[..., 1]),
+    }
+
+
+def _of_changes(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> dict[str, Any]:
+    row, other = (np.array([getattr(one, name) for one in changes], int) for name in ("row", "other"))
+    own = {name: plane.sets[name].values for name in ("attractor", "kind", "orbit_period", "n_cells")}
+    after = np.where(other >= 0, own["orbit_period"][other], -1) if len(row) else row
+    places = np.array([one.place for one in found]).reshape(-1, 2)
+    variables: dict[str, Any] = {
+        "change_attractor": ("change", own["attractor"][row].astype(np.int32)),
+        "change_set": ("change", own["kind"][row].astype(np.int8), code_flags(SETS)),
+        "change_period": ("change", own["orbit_period"][row].astype(np.int32)),
+        "period_after": ("change", after.astype(np.int32)),
+        "what": ("change", np.array([WHATS.index(one.what) for one in found], np.int8), code_flags(WHATS)),
+        "on_curve": ("change", np.array([one.curve for one in found], np.int32)),
+        "on_line": ("change", np.array([one.line for one in found], np.int32)),
+        "change_cells": ("change", own["n_cells"][row].astype(np.int32)),
+        "why": ("change", np.array([one.why for one in found], object)),
+        "change_error": ("change", np.array([one.error for one in found], float)),
+    }
+    for axis, which in enumerate(("first", "second")):
+        variables[f"change_{which}"] = ("change", places[:, axis])
+        for role in ("here", "there"):
+            nodes = np.array([getattr(one, role) for one in changes], int)
+            variables[f"{role}_{which}"] = ("change", plane.values[nodes, axis])
+    return variables

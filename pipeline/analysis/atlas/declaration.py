@@ -1,0 +1,153 @@
+"""Declare the atlas of a plane of two parameters, and what it rests on."""
+
+from __future__ import annotations
+
+from pipeline.analysis.branches.declaration import CURVE_COLUMNS
+from pipeline.products.column import STATES, Columns, over, swept, with_parts
+from pipeline.products.product import Analysis, Figure, FigureOptions, Options, option
+
+_ROOM = "pipeline.analysis.atlas.analysis"
+
+
+class PlaneOptions(Options):
+    """Options that choose the plane of two parameters."""
+
+    parameter: str = option("", "First parameter, along the horizontal axis; by default the run's first axis.")
+    second: str = option("", "Second parameter, along the vertical axis; by default the run's other axis.")
+    at: dict[str, float] = option({}, "Value of a further axis of the run.")
+
+
+class AtlasOptions(PlaneOptions):
+    """Options of the atlas."""
+
+    curve_period: int = option(
+        0,
+        "Longest orbit period on curves that spring from others; 0 takes that of the attractors.",
+        unit="drive periods or returns",
+        ge=0,
+    )
+    places: int = option(
+        5,
+        "Places at which the end of a chaotic set or a torus is named along each line of such ends, as analyse events "
+        "does; 0 names none.",
+        ge=0,
+    )
+
+
+def _plane(role: str, dims: str, text: str) -> Columns:
+    """Return the columns of a point of the plane: its values of both parameters."""
+    return tuple(
+        column
+        for which in ("first", "second")
+        for column in swept(
+            f"{role}_{which}", dims, f"{text}, value of the {which} parameter", f"{role}_{{{which}_parameter}}"
+        )
+    )
+
+
+ENDS_COLUMNS: Columns = (
+    *over(
+        "end",
+        set_row="row of the attractor",
+        what="what ends it",
+        end_period="period of the orbit there",
+        why="evidence, or why it was not followed",
+        end_error="error of the place, in units of the plane",
+    ),
+    *_plane("end", "end", "place of the end"),
+    *over("end state", STATES, end_section="a section point there"),
+)
+
+ORBIT_ENDS = Analysis(
+    "orbit_ends",
+    "Follow each orbit that a neighbouring parameter point lacks to its end.",
+    PlaneOptions,
+    compute=f"{_ROOM}:orbit_ends",
+    columns=ENDS_COLUMNS,
+    parts=f"{_ROOM}:ways",
+    rows="end",
+    together=32,
+    settle=f"{_ROOM}:settle_plane",
+    builds_on=("attractors",),
+)
+
+ATLAS_COLUMNS: Columns = (
+    *CURVE_COLUMNS,
+    *over(
+        "curve",
+        n_crossed="pairs of neighbouring points between which its stable part passes",
+        n_effects="of these, pairs whose attractors it changes",
+        effect="why it changes no attractor, if it changes none",
+    ),
+    *over("curve point", others_unstable="unstable multipliers beside the critical ones"),
+    *over("line", line_what="what lies on the line", line_period="period of the orbit, 0 none"),
+    *over("line", line_size="points of the line", n_tested="places at which it was named"),
+    *_plane("line", "line vertex", "point of the line"),
+    *over(
+        "change",
+        change_attractor="id of the attractor that ends",
+        change_set="kind of the attractor",
+        change_period="period of the attractor, 0 none",
+        period_after="period of the same attractor at the neighbour, -1 if it is not there",
+        what="what explains the change",
+        on_curve="curve that explains it, -1 none",
+        on_line="line on which it lies, -1 none",
+        change_cells="cells on the attractor",
+        why="evidence, or what was tried",
+    ),
+    *_plane("change", "change", "place of the change"),
+    *over("change", change_error="error of the place, in units of the plane"),
+    *_plane("here", "change", "point with the attractor"),
+    *_plane("there", "change", "its neighbour"),
+    *over(
+        "region",
+        area="share of the plane",
+        region_points="parameter points in it",
+        region_cells="cells with a known outcome in it",
+        is_thin="1 if so few cells may miss a basin of 1 %",
+        region_label="periods of its attractors",
+    ),
+    *_plane("label", "region", "point well inside"),
+    *over(
+        "member",
+        of_region="region",
+        member_attractor="id of an attractor that is met in the region",
+        member_set="kind of the attractor",
+        member_period="period of the attractor, 0 none",
+        member_points="parameter points at which it is met",
+    ),
+    *with_parts(over("member", member_share="share of the cells of the region"), "low", "high"),
+    *over("border", between="curve or line between two regions", border_length="length, in units of the plane"),
+    *over("border side", neighbour="regions on both sides"),
+    *over("ring", ring_region="region that it bounds", ring_size="corners", is_hole="1 if it bounds a hole"),
+    *_plane("corner", "corner", "corner of a ring"),
+)
+
+ATLAS = Analysis(
+    "atlas",
+    """Chart a plane of two parameters: curves and lines, the regions between them, and every change that none explains.
+
+    Each attractor that a neighbouring parameter point lacks is followed to its end. Bifurcations are continued as
+    curves, the plane is cut into regions, and each change is listed with what explains it, or as not explained. Curves
+    without an effect on attractors say why.""",
+    AtlasOptions,
+    compute=f"{_ROOM}:atlas",
+    whole="curves are followed in step; the orbits' ends before are in parts",
+    columns=ATLAS_COLUMNS,
+    table="pipeline.analysis.atlas.table:atlas_table",
+    settle=f"{_ROOM}:settle_plane",
+    builds_on=("orbit_ends",),
+    figure="atlas",
+)
+
+
+class AtlasFigureOptions(AtlasOptions, FigureOptions):
+    """Options of the figure of the atlas."""
+
+
+ATLAS_FIGURE = Figure(
+    "atlas",
+    "Draw the atlas of a plane: regions by their attractors, curves by kind, and the changes that are not explained.",
+    AtlasFigureOptions,
+    "pipeline.analysis.atlas.figure:draw_atlas",
+)

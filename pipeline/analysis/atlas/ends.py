@@ -1,0 +1,163 @@
+"""Follow orbits from one parameter point towards a neighbouring one, to the bifurcation at which they end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
+from pipeline.analysis.branches.bifurcations import Bifurcation, n_unstable
+from pipeline.analysis.branches.exploring import first_of
+from pipeline.analysis.branches.following import Branch, half_branch, half_orbit, opposite, problem_of
+from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, LIMITS
+from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.limits import settle_limits
+from pipeline.analysis.branches.lockstep import Query, Steps, run_together
+from pipeline.analysis.branches.normal_forms import judge
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.events.grazing import grazing_of
+from pipeline.analysis.events.kinds import LIVES_ON, UNDECIDED
+from pipeline.analysis.events.lines import Line
+
+TRACE = Settings(beyond=2)
+"""Settings of the branches: they end soon beyond the stable part."""
+
+GOES_ON, SHRINKS, TOUCHES = "goes_on", "shrinks", "touches"
+"""The orbit goes on under another id, or a cycle ends: it shrinks to an equilibrium, or touches the
+section, where the number of its returns changes."""
+
+WHAT = {"equilibrium": SHRINKS, "tangent": TOUCHES, "other_section": TOUCHES}
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """Where the stable part of a branch ends on the way to the neighbouring point."""
+
+    what: str
+    value: float = np.nan  # of the parameter along the way
+    error: float = np.nan
+    period: int = 0  # of the orbit at the bifurcation
+    state: np.ndarray | None = None  # a section point of it, or of the orbit at the neighbouring point
+    why: str = ""
+
+
+def follow_all(starts: Sequence[tuple[Start, float]], what: str = "") -> list[End]:
+    """Follow orbits until they are not stable any more, at most to a value of the parameter given with each.
+
+    Returns
+    -------
+    list of End
+        `LIVES_ON` for an orbit that is stable up to the given value.
+    """
+    branches = run_together([_towards(start, target) for start, target in starts], what)
+    found = [branch for branch in branches if branch is not None]
+    settle_limits(found)
+    judge([(b.family, one) for b in found for one in _lost(b)[:1] if one.kind == BRANCHING])
+    return [_end(branch, target) for branch, (_, target) in zip(branches, starts, strict=True)]
+
+
+def _towards(start: Start, target: float) -> Steps[Branch | None]:
+    found = yield from first_of(start, TRACE)
+    if found is None:
+        return None
+    family, point = found
+    # the starting orbit lies on no bound: its value is known up to rounding
+    low, high = sorted((2.0 * start.value - target, target))
+    half = yield from half_branch(family, point if target > start.value else opposite(point), low, high, TRACE)
+    return Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end))
+
+
+def _lost(branch: Branch) -> list[Bifurcation]:
+    """Return the bifurcations at which a stable branch ceases to be, or turns back as at a pitchfork."""
+    back = branch.ends[1] == "bound" and (branch.values[-1] - branch.values[0]) * branch.points[0].tangent[-1] < 0.0
+    return [
+        one
+        for one in branch.bifurcations
+        if one.n_unstable_before == 0 and (one.n_unstable_after > 0 or (back and one.kind in (BRANCHING, FOLD)))
+    ]
+
+
+def _end(branch: Branch | None, target: float) -> End:
+    if branch is None:
+        return End(UNDECIDED, why="Newton's method finds no orbit there")
+    family, last, end = branch.family, branch.points[-1], branch.ends[1]
+    lost = _lost(branch)
+    if n_unstable(branch.points[0]):
+        return End(UNDECIDED, why="the orbit on which cells end is not stable")
+    if lost:
+        one = lost[0]
+        value = float(family.values(one.point.u)[0])
+        return End(one.kind, value, one.bracket, family.period, family.state(one.point.u))
+    value = float(family.values(last.u)[0])
+    if end == "bound" and abs(value - target) < 0.5 * abs(target - branch.values[0]):
+        return End(LIVES_ON, value, 0.0, family.period, family.state(last.u))
+    if end == "period_halving":
+        state, value = half_orbit(family, last)
+        step = abs(family.values(last.u)[0] - family.values(branch.points[-2].u)[0])
+        return End(DOUBLING, value, float(step), family.period // 2, state)
+    if end in LIMITS:
+        limit = branch.limits[1]
+        assert limit is not None
+        return End(end, limit.value, limit.error, family.period, limit.states[0])
+    if end in WHAT:
+        return End(WHAT[end], value, abs(value - float(branch.values[-2])), family.period, family.state(last.u))
+    return _touch(branch) or End(UNDECIDED, value, np.nan, family.period, family.state(last.u), why=_why(branch))
+
+
+def _touch(branch: Branch) -> End | None:
+    """Return the end of an orbit that begins to touch a surface of impacts or switches."""
+    family, n = branch.family, len(branch.points)
+    states = np.array([family.state(point.u) for point in branch.points])[:, None]
+    nodes, stable = np.full(n, -1), np.ones(n - 1, bool)
+    line = Line(0, family.period, branch.values, states, nodes, nodes, stable, branch.ends)
+    found = grazing_of(line, n - 1, family)
+    return None if found is None else End(found[0], found[1], found[2], family.period, states[-1, 0], found[3])
+
+
+def _why(branch: Branch) -> str:
+    name = branch.family.free[0]
+    value = float(branch.values[-1])
+    reasons = {
+        "stuck": "Newton's method finds no next orbit",
+        "max_points": "the branch has as many points as it may",
+        "closed": "the branch closes",
+        "bound": "the branch turns back without a bifurcation",
+        "unstable": "the branch loses its stability where no bifurcation could be located",
+    }
+    return f"{reasons.get(branch.ends[1], branch.ends[1])} at {name} = {value:.9g}"
+
+
+def beside_all(places: Sequence[tuple[Family, np.ndarray, tuple[float, float]]]) -> list[list[End]]:
+    """Follow the stable orbits that begin at bifurcations, along one parameter up to the bounds given with each.
+
+    Parameters
+    ----------
+    places
+        Family of the orbits at the bifurcation, their unknowns, and the values of the parameter on both sides.
+
+    Returns
+    -------
+    list of list of End
+        Of each bifurcation the ends of the stable orbits beside it, see `follow_all`.
+    """
+    return [
+        [_end(branch, target) for branch, target in found]
+        for found in run_together([_beside(*place) for place in places])
+    ]
+
+
+def _beside(family: Family, u: np.ndarray, bounds: tuple[float, float]) -> Steps[list[tuple[Branch, float]]]:
+    """Follow both parts of the branch through a bifurcation; return those that begin as stable orbits."""
+    problem = problem_of(family)
+    value = yield Query(problem, u)
+    point = (yield from correct(problem, u, kernel_of(value), TRACE)) if value.is_finite else None
+    found = []
+    for way in () if point is None else (opposite(point), point):
+        half = yield from half_branch(family, way, *bounds, TRACE, from_bifurcation=True)
+        points = half.trace.points
+        if len(points) > 2 and not n_unstable(points[1]):
+            branch = Branch(family, points[1:], half.bifurcations, ("start", half.trace.end))
+            found.append((branch, bounds[branch.values[-1] > branch.values[0]]))
+    return found

@@ -1,0 +1,132 @@
+"""Cut the plane into regions, and list the attractors that cells find in each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.analysis.atlas.arrangement import Arrangement, arranged
+from pipeline.analysis.atlas.lines import Line
+from pipeline.analysis.atlas.plane import Array, Plane
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.tabular import plain
+
+SEEN = 299
+"""Fewest cells of which one is in a basin of 1 % with a probability of 95 %: ln .05 / ln .99."""
+
+_LEAST_TOLERANCE = 1e-6
+
+
+def variables_of_regions(
+    plane: Plane, tracks: Sequence[Array], stable: Sequence[Array], lines: Sequence[Line]
+) -> dict[str, Any]:
+    """Return the variables of the regions between the stable parts of curves, and lines.
+
+    The number of a border is that of a curve; those of lines follow.
+    """
+    owner, tolerances, parts = [], [], []
+    for number, (track, good) in enumerate(zip(tracks, stable, strict=True)):
+        for part in _runs(track, good):
+            owner.append(number)
+            parts.append(part)
+    for number, line in enumerate(lines, len(tracks)):
+        if len(line.places) > 1:
+            owner.append(number)
+            parts.append(plane.scaled(line.places))
+    tolerances = [_bend(part) for part in parts]
+    found = arranged(parts, tolerances)
+    region = found.region_of(plane.scaled(plane.values))
+    return {**_regions(plane, found, region), **_members(plane, region), **_borders(found, owner, plane)}
+
+
+def _runs(track: Array, good: Array) -> Iterator[Array]:
+    """Yield the parts of a curve whose points are all good."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(int)))
+    for first, stop in edges.reshape(-1, 2).tolist():
+        if stop - first > 1:
+            yield track[first:stop]
+
+
+def _bend(track: Array) -> float:
+    """Bound the distance of a smooth curve from the chords between its points."""
+    if len(track) < 3:
+        return _LEAST_TOLERANCE
+    return max(_LEAST_TOLERANCE, float(np.linalg.norm(np.diff(track, 2, axis=0), axis=1).max()) / 8.0)
+
+
+def _regions(plane: Plane, found: Arrangement, region: Array) -> dict[str, Any]:
+    n = len(found.regions)
+    points = np.bincount(region, minlength=n)
+    cells = np.bincount(region, plane.n_known, minlength=n)
+    labels = np.array([one.label for one in found.regions]) * plane.size + plane.low
+    return {
+        "area": ("region", np.array([one.area for one in found.regions])),
+        "region_points": ("region", points.astype(np.int32)),
+        "region_cells": ("region", cells.astype(np.int64)),
+        "is_thin": ("region", (cells < SEEN).astype(np.int8)),
+        "label_first": ("region", labels[:, 0]),
+        "label_second": ("region", labels[:, 1]),
+        "region_label": ("region", np.array(_names(plane, region, n), object)),
+    }
+
+
+def _names(plane: Plane, region: Array, n: int) -> list[str]:
+    """Return the attractors that most points of a region have, as a text."""
+    kinds, periods = (plane.sets[name].values[plane.rows] for name in ("kind", "orbit_period"))
+    names = []
+    for number in range(n):
+        nodes = np.flatnonzero(region == number)
+        own = np.isin(plane.node, nodes)
+        sets: dict[int, list[tuple[int, int]]] = {int(node): [] for node in nodes}
+        for node, kind, period in zip(plane.node[own], kinds[own], periods[own], strict=True):
+            sets[int(node)].append((int(kind), int(period)))
+        common = Counter(tuple(sorted(one)) for one in sets.values()).most_common(1)
+        names.append(" + ".join(_name(*one) for one in common[0][0]) if common else "not seen")
+    return [name or "none" for name in names]
+
+
+def _name(kind: int, period: int) -> str:
+    if kind == PERIODIC_ORBIT:
+        return str(period) if period else "cycle"
+    return "rest" if kind == EQUILIBRIUM else plain(SETS[kind])
+
+
+def _members(plane: Plane, region: Array) -> dict[str, Any]:
+    own = {name: plane.sets[name].values[plane.rows] for name in ("attractor", "kind", "orbit_period", "n_cells")}
+    keys = np.stack([region[plane.node], own["attractor"], own["kind"], own["orbit_period"]], axis=-1)
+    found, which = np.unique(keys, axis=0, return_inverse=True)
+    which = which.ravel()
+    cells = np.bincount(which, own["n_cells"], minlength=len(found))
+    total = np.bincount(region, plane.n_cells, minlength=int(region.max(initial=0)) + 1)[found[:, 0]]
+    low, high = binomial_interval(cells, np.maximum(total, 1))
+    return {
+        "of_region": ("member", found[:, 0].astype(np.int32)),
+        "member_attractor": ("member", found[:, 1].astype(np.int32)),
+        "member_set": ("member", found[:, 2].astype(np.int8), code_flags(SETS)),
+        "member_period": ("member", found[:, 3].astype(np.int32)),
+        "member_points": ("member", np.bincount(which, minlength=len(found)).astype(np.int32)),
+        "member_share": ("member", cells / np.maximum(total, 1)),
+        "member_share_low": ("member", low),
+        "member_share_high": ("member", high),
+    }
+
+
+def _borders(found: Arrangement, owner: Sequence[int], plane: Plane) -> dict[str, Any]:
+    rings = [(number, k, ring) for number, one in enumerate(found.regions) for k, ring in enumerate(one.rings)]
+    corners = np.concatenate([ring for _, _, ring in rings]) * plane.size + plane.low
+    return {
+        "between": ("border", np.array([owner[one.line] for one in found.borders], np.int32)),
+        "border_length": ("border", np.array([one.length for one in found.borders], float)),
+        "neighbour": (("border", "side"), np.array([one.regions for one in found.borders], np.int32).reshape(-1, 2)),
+        "ring_region": ("ring", np.array([number for number, _, _ in rings], np.int32)),
+        "ring_size": ("ring", np.array([len(ring) for _, _, ring in rings], np.int32)),
+        "is_hole": ("ring", np.array([k > 0 for _, k, _ in rings], np.int8)),
+        "corner_first": ("corner", corners[:, 0]),
+        "corner_second": ("corner", corners[:, 1]),
+    }
