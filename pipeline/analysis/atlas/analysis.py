@@ -47,7 +47,7 @@ def settle_plane(run: OpenRun, options: Given) -> Given:
     for name in names:
         if "branch" in run.cube().dims or swept_axis(run, name) is None:
             raise SpecError(
-                f"an atlas needs a sweep over two parameters, and this run does not sweep {in_words(run, name)}: [axes]."
+                f"an atlas needs a sweep over two parameters; {in_words(run, name)} is not swept (see [axes])."
             )
     if axis_name(names[0]) == axis_name(names[1]):
         raise SpecError(f"--parameter and --second are both {in_words(run, names[0])}; give two parameters.")
@@ -64,7 +64,7 @@ def _plane(run: OpenRun, options: PlaneOptions) -> Plane:
 def ways(run: OpenRun, options: PlaneOptions) -> list[list[float]]:
     """List the orbits to follow: the row of each, the parameter along which (0 or 1), and up to which value."""
     plane = _plane(run, options)
-    return [list(way) for way in _ways(plane, changes_of(plane))]
+    return [list(way) for way in _ways(plane, changes_of(plane, run.model.system))]
 
 
 def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float]]:
@@ -72,9 +72,8 @@ def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float
     found = []
     for one in changes:
         axis = plane.axis_of(one.edge)
-        for row, node in ((one.row, one.there), (one.other, one.here)):
-            if row >= 0 and kinds[row] not in APERIODIC:
-                found.append((row, axis, float(plane.values[node, axis])))
+        if kinds[one.row] not in APERIODIC:
+            found.append((one.row, axis, float(plane.values[one.there, axis])))
     return found
 
 
@@ -90,8 +89,9 @@ def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[fl
         there[rows[own]] = True
         found = listed(plane.sets, base, name, float(plane.size[axis]), there)
         start = dict(zip(np.flatnonzero(there).tolist(), (one.start for one in found), strict=True))
-        asked = [(k, one, float(wanted[k][2])) for k in own if (one := start[int(rows[k])]) is not None]
-        for (k, _, _), end in zip(asked, follow_all([way[1:] for way in asked]), strict=True):
+        asked = [(k, first) for k in own if (first := start[int(rows[k])]) is not None]
+        followed = follow_all([(first, float(wanted[k][2])) for k, first in asked])
+        for (k, _), end in zip(asked, followed, strict=True):
             ends[k] = end
     node = dict(zip(plane.rows.tolist(), plane.node.tolist(), strict=True))
     places = plane.values[[node[row] for row in rows.tolist()]].copy()
@@ -127,14 +127,12 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
         ``region``, ``member`` (attractors of regions), ``border`` and ``ring``.
     """
     plane = _plane(run, options)
-    changes = changes_of(plane)
+    changes = changes_of(plane, run.model.system)
     run.echo(f"atlas: {len(changes)} changes between {len(plane.edges)} pairs of neighbouring points")
     ends = run.derive("orbit_ends", **options.part(PlaneOptions))
     kinds = plane.sets["kind"].values
     count = iter(range(ends.sizes["end"]))
-    numbers = [
-        [next(count) for row in (one.row, one.other) if row >= 0 and kinds[row] not in APERIODIC] for one in changes
-    ]
+    numbers = [-1 if kinds[one.row] in APERIODIC else next(count) for one in changes]
     found = verdicts(plane, changes, numbers, ends, run.model.system)
     chart = _charted(run, options, plane, changes, found)
     lines = _lines(plane, changes, found)
@@ -143,7 +141,9 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     others = [others_unstable(curve) for curve in chart.curves]
     told = effects_of(plane, changes, found, chart.curves, tracks, [one == 0 for one in others])
     variables = {**_of_curves(curves, others, told), **_of_lines(lines), **_of_changes(plane, changes, found)}
-    variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines)
+    same = [(change.row, one.row) for change, one in zip(changes, found, strict=True) if one.row >= 0]
+    pairs = np.array(same, int).reshape(-1, 2)
+    variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines, pairs)
     return curves.assign(variables)
 
 
@@ -159,7 +159,11 @@ def _charted(
     run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]
 ) -> Chart:
     """Continue the located bifurcations, and give each change the curve on which it lies."""
-    own = [k for k, one in enumerate(found) if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None]
+    own = [
+        k
+        for k, one in enumerate(found)
+        if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None and one.period <= options.curve_period
+    ]
     numbers = plane.sets["attractor"].values
     families = {period: _family(run, plane, period) for period in {0, *(found[k].period for k in own)}}
     located = [
@@ -179,8 +183,7 @@ def _charted(
         if name == FREQUENCY:
             low[axis] = max(low[axis], 0.5 * plane.low[axis])
     bounds = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
-    longest = options.curve_period or int(plane.sets["orbit_period"].values[plane.rows].max(initial=1))
-    chart = charted(located, bounds, longest)
+    chart = charted(located, bounds, options.curve_period)
     for k, curve in zip(own, chart.curve_of.tolist(), strict=True):
         found[k].curve = curve
     return chart

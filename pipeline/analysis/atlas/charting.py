@@ -22,8 +22,8 @@ from pipeline.analysis.branches.problems import TESTS, Family
 Key = tuple[str, int]
 """Kind of a bifurcation, and the period of the orbit."""
 
-ROUNDS, TRIES = 12, 3
-"""Most rounds in which curves are started, and most starts of one attractor's bifurcations that lead to no curve."""
+TRIES = 3
+"""Most starts of one attractor's bifurcations of a kind and period that lead to no curve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,25 +104,31 @@ class Chart:
                     self.curve_of[i] = number
 
     def grow(self, bounds: Bounds, longest: int, generations: int) -> None:
-        """Start curves at bifurcations, one of each attractor and kind at a time, until all lie on curves."""
+        """Start a curve of each kind and period at a time, until all bifurcations lie on curves or no start helps."""
         tried: dict[tuple[Any, ...], int] = {}
         asked: set[int] = set()
-        for _ in range(ROUNDS):
-            groups: dict[tuple[Any, ...], list[int]] = {}
+        while True:
+            groups: dict[Key, dict[int, list[int]]] = {}
             for i in np.flatnonzero(self.curve_of < 0).tolist():
-                if i not in asked:
-                    groups.setdefault((*self.located[i].key, self.located[i].attractor), []).append(i)
-            chosen = [own[len(own) // 2] for key, own in sorted(groups.items()) if tried.get(key, 0) < TRIES]
+                one = self.located[i]
+                if i not in asked and tried.get((*one.key, one.attractor), 0) < TRIES:
+                    groups.setdefault(one.key, {}).setdefault(one.attractor, []).append(i)
+            largest = [max(groups[key].values(), key=len) for key in sorted(groups)]
+            chosen = [own[len(own) // 2] for own in largest]
             starts = [s for i in chosen if (s := self.located[i].start(i)) is not None]
             asked |= set(chosen)
             if not starts:
-                return
+                if not chosen:
+                    return
+                for i in chosen:  # bifurcations of this kind have no curve
+                    tried[(*self.located[i].key, self.located[i].attractor)] = TRIES
+                continue
             found = continue_curves(starts, bounds, CURVE, longest, generations, self.lost, self.curves)
             self.curves += found
             self._settle(found)
-            for key, own in groups.items():
-                helped = any(self.curve_of[i] >= 0 for i in own)
-                tried[key] = 0 if helped else tried.get(key, 0) + 1
+            for i in chosen:
+                key = (*self.located[i].key, self.located[i].attractor)
+                tried[key] = 0 if self.curve_of[i] >= 0 else tried.get(key, 0) + 1
 
     def add_homoclinic(self, bounds: Bounds) -> None:
         """Follow the homoclinic orbits that spring from Bogdanov-Takens points."""
@@ -140,7 +146,7 @@ class Chart:
                     self.curve_of[i] = number
 
 
-def charted(located: Sequence[Located], bounds: Bounds, longest: int, generations: int = 3) -> Chart:
+def charted(located: Sequence[Located], bounds: Bounds, longest: int, generations: int = 1) -> Chart:
     """Continue bifurcations as curves in the plane, each curve once, with those that spring from points on them.
 
     Parameters

@@ -21,10 +21,10 @@ class AtlasOptions(PlaneOptions):
     """Options of the atlas."""
 
     curve_period: int = option(
-        0,
-        "Longest orbit period on curves that spring from others; 0 takes that of the attractors.",
+        4,
+        "Longest orbit period whose bifurcations are continued as curves; those of longer orbits are joined to lines.",
         unit="drive periods or returns",
-        ge=0,
+        ge=1,
     )
     places: int = option(
         5,

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from magpend_core.orbits import scaled_distance
 from pipeline.analysis.atlas.ends import beside_all
 from pipeline.analysis.atlas.plane import Array, Change, Plane
-from pipeline.analysis.atlas.verdicts import SAME, Verdict, rows_at
+from pipeline.analysis.atlas.verdicts import Verdict, met_at, rows_at
 from pipeline.analysis.branches.curves import Curve
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, HOMOCLINIC
 from pipeline.analysis.events.kinds import LIVES_ON
@@ -147,9 +146,7 @@ def _silence(plane: Plane, curve: Curve, crossed: Crossings, own: Sequence[int])
         for one in reached:
             axis = plane.axis_of(crossed.edge[k])
             node = nodes[int(np.argmin(np.abs(plane.values[nodes, axis] - one.value)))]
-            there = [points[row] for row in rows[node]]
-            state = np.asarray(one.state)
-            is_met = any(scaled_distance(p, state, curve.family.system).min() < SAME for p in there if len(p))
+            is_met = met_at(points, rows[node], np.asarray(one.state), curve.family.system) >= 0
             told["the stable orbit is met on its side" if is_met else "no cell finds the stable orbit"] += 1
         if not reached:
             told["the stable orbit ends before the next point" if found else "no stable orbit could be followed"] += 1

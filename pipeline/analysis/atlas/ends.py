@@ -159,5 +159,5 @@ def _beside(family: Family, u: np.ndarray, bounds: tuple[float, float]) -> Steps
         points = half.trace.points
         if len(points) > 2 and not n_unstable(points[1]):
             branch = Branch(family, points[1:], half.bifurcations, ("start", half.trace.end))
-            found.append((branch, bounds[branch.values[-1] > branch.values[0]]))
+            found.append((branch, bounds[int(branch.values[-1] > branch.values[0])]))
     return found

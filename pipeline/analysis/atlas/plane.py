@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from pipeline.layout.vocabulary import ATTRACTS
+from magpend_core.engine.system import System
+from magpend_core.orbits import wrap_angles
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS
 from pipeline.results.outcomes import outcomes
-from pipeline.results.ragged import dims_of, point_of_rows
+from pipeline.results.ragged import dims_of, point_of_rows, points_of_rows
 from pipeline.results.selection import choose, start_dims
 
 Array = np.ndarray[Any, Any]
 
 
 class Change(NamedTuple):
-    """An attractor at one of two neighbouring points that is not at the other, or has another kind or period there."""
+    """An attractor at one of two neighbouring points that is not at the other, has another kind or period there, or may
+    have jumped.
+    """
 
     edge: int
     here: int  # node at which it is
@@ -88,19 +92,64 @@ def plane_of(found: xr.Dataset, names: tuple[str, str], at: Mapping[str, float] 
     return Plane(names, shape, values, np.concatenate(edges), part, rows, node, n_cells, known)
 
 
-def changes_of(plane: Plane) -> list[Change]:
-    """List the attractors that differ between neighbouring points, by edge and id."""
+def changes_of(plane: Plane, system: System) -> list[Change]:
+    """List the attractors that differ, or may differ, between neighbouring points, by edge and id.
+
+    Around a cusp one id passes from one sheet of orbits to the other. So an orbit that moves between two points by more
+    than beside them is listed as well: it may have jumped.
+    """
     numbers, kinds, periods = (plane.sets[name].values for name in ("attractor", "kind", "orbit_period"))
     at: list[dict[int, int]] = [{} for _ in range(len(plane.values))]
     for row, node in zip(plane.rows.tolist(), plane.node.tolist(), strict=True):
         at[node][int(numbers[row])] = row
     alike = np.stack([kinds, periods], axis=-1).tolist()
-    found = []
+    found: list[Change] = []
+    pairs: list[Change] = []
     for edge, (a, b) in enumerate(plane.edges.tolist()):
         for number in sorted(at[a].keys() | at[b].keys()):
             rows = at[a].get(number, -1), at[b].get(number, -1)
             if rows[0] < 0:
                 found.append(Change(edge, b, a, rows[1], -1))
             elif rows[1] < 0 or alike[rows[0]] != alike[rows[1]]:
-                found.append(Change(edge, a, b, *rows))
+                found += _both_ways(edge, a, b, rows)
+            elif kinds[rows[0]] not in APERIODIC:
+                pairs.append(Change(edge, a, b, *rows))
+    return sorted([*found, *_jumps(plane, pairs, system)])
+
+
+def _both_ways(edge: int, a: int, b: int, rows: tuple[int, int]) -> list[Change]:
+    """Return the changes of an attractor from a point to the next if it is there, and back."""
+    ahead = [Change(edge, a, b, rows[0], rows[1])]
+    return ahead if rows[1] < 0 else [*ahead, Change(edge, b, a, rows[1], rows[0])]
+
+
+def _jumps(plane: Plane, pairs: Sequence[Change], system: System) -> list[Change]:
+    """Return the pairs of orbits that move otherwise than the pairs before and after them on their line of the grid."""
+    least, other = 1e-3, 0.5  # scaled move that is none; largest difference of neighbouring moves, in units of the move
+    moves = {(one.row, one.other): move for one, move in zip(pairs, _moves(plane, pairs, system), strict=True)}
+    before = {(one.other, plane.axis_of(one.edge)): one.row for one in pairs}
+    after = {(one.row, plane.axis_of(one.edge)): one.other for one in pairs}
+    found = []
+    for one in pairs:
+        axis, (move, shift) = plane.axis_of(one.edge), moves[one.row, one.other]
+        size = np.linalg.norm(move)
+        beside = []  # in the order of the points at `here`
+        if (left := before.get((one.row, axis), -1)) >= 0:
+            beside.append(np.roll(*moves[left, one.row], axis=0))
+        if (right := after.get((one.other, axis), -1)) >= 0:
+            beside.append(np.roll(moves[one.other, right][0], -shift, axis=0))
+        if size > least and not any(np.linalg.norm(move - step) < other * size for step in beside):
+            found += _both_ways(one.edge, one.here, one.there, (one.row, one.other))
+    return found
+
+
+def _moves(plane: Plane, pairs: Sequence[Change], system: System) -> list[tuple[Array, int]]:
+    """Return the scaled move of each orbit to its neighbour (phase, state), and the shift of phases to it."""
+    points, periods = points_of_rows(plane.sets), plane.sets["orbit_period"].values
+    scales, found = np.asarray(system.scales), []
+    for one in pairs:
+        phases = max(int(periods[one.row]), 1)
+        here, there = points[one.row][:phases], points[one.other][:phases]
+        shift = int(np.linalg.norm(wrap_angles(there - here[0], system) / scales, axis=-1).argmin())
+        found.append((wrap_angles(np.roll(there, -shift, axis=0) - here, system) / scales, shift))
     return found

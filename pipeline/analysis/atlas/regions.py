@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.analysis.atlas.arrangement import Arrangement, arranged
 from pipeline.analysis.atlas.lines import Line
@@ -15,6 +17,7 @@ from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.results.intervals import binomial_interval
+from pipeline.results.ragged import SET
 from pipeline.results.tabular import plain
 
 SEEN = 299
@@ -24,11 +27,20 @@ _LEAST_TOLERANCE = 1e-6
 
 
 def variables_of_regions(
-    plane: Plane, tracks: Sequence[Array], stable: Sequence[Array], lines: Sequence[Line]
+    plane: Plane, tracks: Sequence[Array], stable: Sequence[Array], lines: Sequence[Line], same: Array
 ) -> dict[str, Any]:
     """Return the variables of the regions between the stable parts of curves, and lines.
 
-    The number of a border is that of a curve; those of lines follow.
+    Parameters
+    ----------
+    plane
+        The plane.
+    tracks, stable
+        Points of curves in units of the plane, and whether the orbits beside them may be stable.
+    lines
+        Further lines. The number of a border is that of a curve; those of lines follow.
+    same
+        Pairs of rows (pair, 2) that are one attractor though their ids differ.
     """
     owner, tolerances, parts = [], [], []
     for number, (track, good) in enumerate(zip(tracks, stable, strict=True)):
@@ -42,7 +54,7 @@ def variables_of_regions(
     tolerances = [_bend(part) for part in parts]
     found = arranged(parts, tolerances)
     region = found.region_of(plane.scaled(plane.values))
-    return {**_regions(plane, found, region), **_members(plane, region), **_borders(found, owner, plane)}
+    return {**_regions(plane, found, region), **_members(plane, region, same), **_borders(found, owner, plane)}
 
 
 def _runs(track: Array, good: Array) -> Iterator[Array]:
@@ -97,21 +109,34 @@ def _name(kind: int, period: int) -> str:
     return "rest" if kind == EQUILIBRIUM else plain(SETS[kind])
 
 
-def _members(plane: Plane, region: Array) -> dict[str, Any]:
+def _members(plane: Plane, region: Array, same: Array) -> dict[str, Any]:
+    """Return the attractors of each region: rows in it that have one id, or are known to be one."""
     own = {name: plane.sets[name].values[plane.rows] for name in ("attractor", "kind", "orbit_period", "n_cells")}
-    keys = np.stack([region[plane.node], own["attractor"], own["kind"], own["orbit_period"]], axis=-1)
-    found, which = np.unique(keys, axis=0, return_inverse=True)
-    which = which.ravel()
-    cells = np.bincount(which, own["n_cells"], minlength=len(found))
-    total = np.bincount(region, plane.n_cells, minlength=int(region.max(initial=0)) + 1)[found[:, 0]]
-    low, high = binomial_interval(cells, np.maximum(total, 1))
+    where = region[plane.node]
+    place = np.full(plane.sets.sizes[SET], -1)
+    place[plane.rows] = np.arange(len(plane.rows))
+    pairs = place[same]
+    pairs = pairs[where[pairs[:, 0]] == where[pairs[:, 1]]]
+    order = np.lexsort((own["attractor"], where))
+    is_same = (np.diff(where[order]) == 0) & (np.diff(own["attractor"][order]) == 0)
+    pairs = np.concatenate([pairs, np.stack([order[:-1], order[1:]], axis=-1)[is_same]])
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(where),) * 2)
+    n, which = connected_components(links, directed=False)
+    first = np.full(n, len(where))
+    np.minimum.at(first, which, np.arange(len(where)))
+    order = np.lexsort((own["attractor"][first], where[first]))
+    first, which = first[order], np.argsort(order)[which]
+    cells = np.bincount(which, own["n_cells"], minlength=n)
+    total = np.maximum(np.bincount(region, plane.n_cells, minlength=int(region.max(initial=0)) + 1)[where[first]], 1)
+    low, high = binomial_interval(cells, total)
+    points = [len(np.unique(plane.node[which == k])) for k in range(n)]
     return {
-        "of_region": ("member", found[:, 0].astype(np.int32)),
-        "member_attractor": ("member", found[:, 1].astype(np.int32)),
-        "member_set": ("member", found[:, 2].astype(np.int8), code_flags(SETS)),
-        "member_period": ("member", found[:, 3].astype(np.int32)),
-        "member_points": ("member", np.bincount(which, minlength=len(found)).astype(np.int32)),
-        "member_share": ("member", cells / np.maximum(total, 1)),
+        "of_region": ("member", where[first].astype(np.int32)),
+        "member_attractor": ("member", own["attractor"][first].astype(np.int32)),
+        "member_set": ("member", own["kind"][first].astype(np.int8), code_flags(SETS)),
+        "member_period": ("member", own["orbit_period"][first].astype(np.int32)),
+        "member_points": ("member", np.array(points, np.int32)),
+        "member_share": ("member", cells / total),
         "member_share_low": ("member", low),
         "member_share_high": ("member", high),
     }

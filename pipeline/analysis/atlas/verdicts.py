@@ -32,6 +32,7 @@ class Verdict:
     state: Array | None = None  # a section point of it
     curve: int = -1
     line: int = -1
+    row: int = -1  # row of the orbit at the neighbour, of one that goes on
 
     @property
     def is_seen(self) -> bool:
@@ -45,7 +46,7 @@ class Verdict:
 
 
 def verdicts(
-    plane: Plane, changes: Sequence[Change], numbers: Sequence[Sequence[int]], ends: xr.Dataset, system: System
+    plane: Plane, changes: Sequence[Change], numbers: Sequence[int], ends: xr.Dataset, system: System
 ) -> list[Verdict]:
     """Return the verdict on each change from the ends of its orbits.
 
@@ -54,7 +55,7 @@ def verdicts(
     plane, changes
         The plane, and its changes.
     numbers
-        Numbers of the ends of each change; none of a set that is no orbit.
+        Number of the end of each change; -1 of a set that is no orbit.
     ends
         Result of the analysis ``orbit_ends``.
     system
@@ -65,23 +66,19 @@ def verdicts(
     places = np.stack([ends["end_first"].values, ends["end_second"].values], axis=-1)
     points, node_rows = points_of_rows(plane.sets), rows_at(plane)
     found = []
-    for change, own in zip(changes, numbers, strict=True):
+    for change, k in zip(changes, numbers, strict=True):
         middle = plane.values[[change.here, change.there]].mean(axis=0)
         half = 0.5 * float(np.abs(np.diff(plane.scaled(plane.values[[change.here, change.there]]), axis=0)).max())
-        best = sorted(own, key=lambda k: _rank(whats[k]))
-        if not best:
+        if k < 0:
             found.append(Verdict(UNDECIDED, middle, half, "a set that is no orbit"))
             continue
-        k = best[0]
         state, period = ends["end_section"].values[k], int(ends["end_period"].values[k])
         what, why = whats[k], str(ends["why"].values[k])
         if what == UNDECIDED:
-            why = "; ".join(dict.fromkeys(str(ends["why"].values[i]) for i in own))
             found.append(Verdict(UNDECIDED, middle, half, why))
         elif what == LIVES_ON:
-            there = [points[row] for row in node_rows[change.there]]
-            same = any(len(one) and scaled_distance(one, state, system).min() < SAME for one in there)
-            found.append(Verdict(GOES_ON if same else LIVES_ON, middle, half, why, period, state))
+            row = met_at(points, node_rows[change.there], state, system)
+            found.append(Verdict(LIVES_ON if row < 0 else GOES_ON, middle, half, why, period, state, row=row))
         else:
             error = float(ends["end_error"].values[k])
             found.append(Verdict(what, places[k], error, why, period, state))
@@ -89,8 +86,11 @@ def verdicts(
     return found
 
 
-def _rank(what: str) -> int:
-    return {UNDECIDED: 3, LIVES_ON: 2, SHRINKS: 1}.get(what, 0)
+def met_at(points: Sequence[Array], rows: Sequence[int], state: Array, system: System) -> int:
+    """Return the row, of some at one point of the plane, of the orbit through a state; -1 if it is none of them."""
+    return next(
+        (row for row in rows if len(points[row]) and scaled_distance(points[row], state, system).min() < SAME), -1
+    )
 
 
 def rows_at(plane: Plane) -> list[list[int]]:
