@@ -17,6 +17,7 @@ import typer
 from magpend_core.troubleshooting import see
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.animate import animate
+from pipeline.cli.atlas import atlas
 from pipeline.cli.common import CommandError
 from pipeline.cli.console import EnoughError, Exit, visible
 from pipeline.cli.extend import extend
@@ -62,6 +63,7 @@ for _command in (
     verify,
     extend,
     zoom,
+    atlas,
     drawing(simulate),
     animate,
     report,

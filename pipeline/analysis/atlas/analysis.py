@@ -9,13 +9,14 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.atlas.charting import Chart, Located, charted, others_unstable
-from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions
+from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions, SetEndOptions
 from pipeline.analysis.atlas.effects import Effect, effects_of
 from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End, follow_all
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
 from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, plane_of
 from pipeline.analysis.atlas.regions import variables_of_regions
 from pipeline.analysis.atlas.verdicts import Verdict, verdicts
+from pipeline.analysis.atlas.windows import carried, chosen, named, set_lines
 from pipeline.analysis.branches.curves import curves_dataset
 from pipeline.analysis.branches.intervals import in_words, swept_axis
 from pipeline.analysis.branches.kinds import HOMOCLINIC, KINDS, SNIC
@@ -80,7 +81,7 @@ def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float
 def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[float]]) -> xr.Dataset:
     """Follow orbits that a neighbouring point lacks towards that point."""
     plane = _plane(run, options)
-    base, n = parameters_of(run.cube()), len(run.model.state_names)
+    base = parameters_of(run.cube())
     ends = [End(UNDECIDED, why="Newton's method found no orbit there")] * len(wanted)
     rows = np.array([int(one[0]) for one in wanted], int)
     for axis, name in enumerate(plane.names):
@@ -93,6 +94,29 @@ def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[fl
         followed = follow_all([(first, float(wanted[k][2])) for k, first in asked])
         for (k, _), end in zip(asked, followed, strict=True):
             ends[k] = end
+    return _dataset(run, plane, wanted, ends)
+
+
+def windows(run: OpenRun, options: SetEndOptions) -> list[list[float]]:
+    """List the sets to name: the row of each, the parameter along which (0 or 1), and the value of the neighbour."""
+    plane = _plane(run, options)
+    changes = changes_of(plane, run.model.system)
+    return [
+        [changes[k].row, plane.axis_of(changes[k].edge), plane.values[changes[k].there, plane.axis_of(changes[k].edge)]]
+        for k in chosen(set_lines(plane, changes), options.windows)
+    ]
+
+
+def set_ends(run: OpenRun, options: SetEndOptions, wanted: Sequence[Sequence[float]]) -> xr.Dataset:
+    """Name ends of chaotic sets and tori between neighbouring points."""
+    plane, base = _plane(run, options), parameters_of(run.cube())
+    ends = [named(plane, int(row), int(axis), float(target), base) for row, axis, target in wanted]
+    return _dataset(run, plane, wanted, ends)
+
+
+def _dataset(run: OpenRun, plane: Plane, wanted: Sequence[Sequence[float]], ends: Sequence[End]) -> xr.Dataset:
+    """Return ends between neighbouring points as rows."""
+    rows, n = np.array([int(one[0]) for one in wanted], int), len(run.model.state_names)
     node = dict(zip(plane.rows.tolist(), plane.node.tolist(), strict=True))
     places = plane.values[[node[row] for row in rows.tolist()]].copy()
     for k, (one, end) in enumerate(zip(wanted, ends, strict=True)):
@@ -129,11 +153,7 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     plane = _plane(run, options)
     changes = changes_of(plane, run.model.system)
     run.echo(f"atlas: {len(changes)} changes between {len(plane.edges)} pairs of neighbouring points")
-    ends = run.derive("orbit_ends", **options.part(PlaneOptions))
-    kinds = plane.sets["kind"].values
-    count = iter(range(ends.sizes["end"]))
-    numbers = [-1 if kinds[one.row] in APERIODIC else next(count) for one in changes]
-    found = verdicts(plane, changes, numbers, ends, run.model.system)
+    found = _verdicts(run, options, plane, changes)
     chart = _charted(run, options, plane, changes, found)
     lines = _lines(plane, changes, found)
     curves = curves_dataset(chart.curves, *plane.names, run.model)
@@ -145,6 +165,22 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     pairs = np.array(same, int).reshape(-1, 2)
     variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines, pairs)
     return curves.assign(variables)
+
+
+def _verdicts(run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change]) -> list[Verdict]:
+    """Say of each change what explains it: of an orbit where it ends, of another set what names its end."""
+    kinds, system = plane.sets["kind"].values, run.model.system
+    count = iter(range(len(changes)))
+    numbers = [-1 if kinds[one.row] in APERIODIC else next(count) for one in changes]
+    found = verdicts(plane, changes, numbers, run.derive("orbit_ends", **options.part(PlaneOptions)), system)
+    lines = set_lines(plane, changes)
+    if tested := chosen(lines, options.windows):
+        ends = run.derive("set_ends", **options.part(SetEndOptions))
+        own = verdicts(plane, [changes[k] for k in tested], range(len(tested)), ends, system)
+        for k, one in zip(tested, own, strict=True):
+            found[k] = one
+    carried(lines, found, tested)
+    return found
 
 
 def _family(run: OpenRun, plane: Plane, period: int) -> Family:
@@ -186,7 +222,25 @@ def _charted(
     chart = charted(located, bounds, options.curve_period)
     for k, curve in zip(own, chart.curve_of.tolist(), strict=True):
         found[k].curve = curve
+    _agree(changes, found)
+    on_edge = {(changes[k].edge, found[k].what): found[k] for k in own if found[k].curve >= 0}
+    for one, change in zip(found, changes, strict=True):  # a torus begins at the bifurcation that ends an orbit
+        if one.curve < 0 and one.state is None and (other := on_edge.get((change.edge, one.what))) is not None:
+            one.curve, one.place, one.error = other.curve, other.place, other.error
     return chart
+
+
+def _agree(changes: Sequence[Change], found: Sequence[Verdict]) -> None:
+    """Give the ends at one crossing of a curve with an edge the place that is known best; in place."""
+    best: dict[tuple[int, int], Verdict] = {}
+    for change, one in zip(changes, found, strict=True):
+        key = change.edge, one.curve
+        if one.curve >= 0 and (key not in best or one.error < best[key].error):
+            best[key] = one
+    for change, one in zip(changes, found, strict=True):
+        known = best.get((change.edge, one.curve))
+        if known is not None and known is not one and known.error < one.error:
+            one.place, one.error = known.place, known.error
 
 
 def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> list[Line]:

@@ -17,7 +17,18 @@ class PlaneOptions(Options):
     at: dict[str, float] = option({}, "Value of a further axis of the run.")
 
 
-class AtlasOptions(PlaneOptions):
+class SetEndOptions(PlaneOptions):
+    """Options for naming the ends of chaotic sets and tori."""
+
+    windows: int = option(
+        24,
+        "Places at which ends of chaotic sets and tori are named, as analyse events does; the places between take the "
+        "name on which those beside them agree. 0 names none.",
+        ge=0,
+    )
+
+
+class AtlasOptions(SetEndOptions):
     """Options of the atlas."""
 
     curve_period: int = option(
@@ -25,12 +36,6 @@ class AtlasOptions(PlaneOptions):
         "Longest orbit period whose bifurcations are continued as curves; those of longer orbits are joined to lines.",
         unit="drive periods or returns",
         ge=1,
-    )
-    places: int = option(
-        5,
-        "Places at which the end of a chaotic set or a torus is named along each line of such ends, as analyse events "
-        "does; 0 names none.",
-        ge=0,
     )
 
 
@@ -67,6 +72,18 @@ ORBIT_ENDS = Analysis(
     parts=f"{_ROOM}:ways",
     rows="end",
     together=32,
+    settle=f"{_ROOM}:settle_plane",
+    builds_on=("attractors",),
+)
+
+SET_ENDS = Analysis(
+    "set_ends",
+    "Name the ends of chaotic sets and tori between neighbouring parameter points.",
+    SetEndOptions,
+    compute=f"{_ROOM}:set_ends",
+    columns=ENDS_COLUMNS,
+    parts=f"{_ROOM}:windows",
+    rows="end",
     settle=f"{_ROOM}:settle_plane",
     builds_on=("attractors",),
 )
@@ -136,7 +153,7 @@ ATLAS = Analysis(
     columns=ATLAS_COLUMNS,
     table="pipeline.analysis.atlas.table:atlas_table",
     settle=f"{_ROOM}:settle_plane",
-    builds_on=("orbit_ends",),
+    builds_on=("orbit_ends", "set_ends"),
     figure="atlas",
 )
 
