@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -45,6 +45,6 @@ def atlas(
             source, out, workers=workers, scheduler=scheduler, cluster=cluster, smoke=smoke, echo=console.note
         )
         directory = done.name
-    chosen = {"parameter": parameter, "second": second}
+    chosen: dict[str, Any] = {"parameter": parameter, "second": second}
     show(directory, "atlas", chosen, workers, where, csv, json)
     draw(directory, "atlas", FIGURES["atlas"].options(**chosen))

@@ -183,7 +183,11 @@ class Registry(Mapping[str, P]):
 
 _CELLS_OWN: Groups = {"": {n: (f"pipeline.products.{n}:{n.upper()}", "") for n in ("lyapunov", "extremes", "rotation")}}
 _FOR_OTHERS: Groups = {
-    "": {"identified": (f"{_room('attractors')}:IDENTIFIED", ""), "orbit_ends": (f"{_room('atlas')}:ORBIT_ENDS", "")}
+    "": {
+        "identified": (f"{_room('attractors')}:IDENTIFIED", ""),
+        "orbit_ends": (f"{_room('atlas')}:ORBIT_ENDS", ""),
+        "set_ends": (f"{_room('atlas')}:SET_ENDS", ""),
+    }
 }
 
 CELL_PRODUCTS: Registry[CellProduct] = Registry(lambda: _CELLS_OWN)

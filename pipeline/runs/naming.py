@@ -31,7 +31,8 @@ def named(run: RunDirectory, options: Options) -> Options:
     ``at`` accepts ``frequency``, ``frequency_hz``, ``omega`` or ``period`` of the drive, a parameter, and for a grid
     of initial states its axis ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second``
     accept these names, too; bounds are then in their unit. ``start`` accepts the parameter in any of its words. An
-    empty ``parameter`` stands for the swept one, an empty ``second`` for the other one of two, an empty ``state`` for the first state that varies between sections.
+    empty ``parameter`` stands for the swept one, an empty ``second`` for the other one of two,
+    an empty ``state`` for the first state that varies between sections.
 
     Raises
     ------
