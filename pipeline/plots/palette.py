@@ -270,11 +270,12 @@ Entry = tuple[str, str] | Artist
 
 
 def new_panel(
-    data: xr.Dataset, entries: Sequence[Entry], frame: style.Frame, height: float = 4.3
+    data: xr.Dataset, entries: Sequence[Entry], frame: style.Frame, height: float = 4.3, *, handle: float = 0.0
 ) -> tuple[style.DataFigure, Axes]:
     """Make a figure with one panel, and a legend beside it (or below it in a narrow figure).
 
-    `height` is the least one [in] at full width; the figure grows with the legend.
+    `height` is the least one [in] at full width; the figure grows with the legend. `handle` is the length of the
+    legend's handles in units of its letters, which dashes need longer.
     """
     look = style.sizes()
     room = frame.width_in * (1.0 if frame.compact else 0.33) - 0.35
@@ -291,7 +292,7 @@ def new_panel(
     style.style_axes(ax, inside=False)
     handles = [_handle(entry, text) for entry, text in zip(entries, lines, strict=True)]
     if frame.compact:
-        style.legend_below(fig, handles)
+        style.legend_below(fig, handles, handle or 1.2)
     elif handles:
         fig.legend(
             handles=handles,
@@ -300,7 +301,7 @@ def new_panel(
             fontsize=look.legend,
             borderpad=0.0,
             borderaxespad=0.2,
-            handlelength=1.1,
+            handlelength=handle or 1.1,
             handleheight=0.9,
             handletextpad=0.5,
             labelspacing=0.42,

@@ -279,9 +279,9 @@ def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | No
     _legend(figure, handles, "outside upper right", size, handletextpad=0.35, handlelength=1.4)
 
 
-def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
-    """Place a legend at the bottom left of a figure."""
-    _legend(figure, handles, "outside lower left", figure.look.legend, handletextpad=0.4, handlelength=1.2)
+def legend_below(figure: DataFigure, handles: Sequence[Any], length: float = 1.2) -> None:
+    """Place a legend at the bottom left of a figure; `length` is that of its handles, in units of its letters."""
+    _legend(figure, handles, "outside lower left", figure.look.legend, handletextpad=0.4, handlelength=length)
 
 
 def _legend(figure: DataFigure, handles: Sequence[Any], place: Any, size: float, **spaces: float) -> None:

@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.basins.declaration import RegimeOptions
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.branches.declaration import CurveFigureOptions, CurveOptions
-from pipeline.analysis.branches.figure import DASHES, draw_over, line_note, mark_points
-from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, NAMES
+from pipeline.analysis.branches.figure import curve_look, draw_over, line_note, mark_points
+from pipeline.analysis.branches.kinds import CURVE_KINDS
 from pipeline.analysis.branches.levels import refuse_at
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, letter, parameter_name
@@ -349,14 +349,6 @@ def _swept_of(run: OpenRun, x: str, y: str) -> str:
     return swept[0] if len(swept) == 1 else x
 
 
-_CURVE_COLOURS = {
-    **dict(zip(KINDS[:3], (style.BLUE, style.VERMILLION, style.GREEN), strict=True)),
-    HOPF: style.ORANGE,
-    HOMOCLINIC: "black",
-    **dict.fromkeys(BRANCH_POINTS, style.PURPLE),
-}
-
-
 @style.drawn
 def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw bifurcation curves and points of codimension two in the plane of two parameters.
@@ -384,10 +376,8 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
         (line,) = ax.plot(
             ds["first"].values[i, :n],
             ds["second"].values[i, :n],
-            color=_CURVE_COLOURS[kind],
-            linestyle=DASHES[periods.index(period) % len(DASHES)],
             linewidth=1.2,
-            label=f"{LABELS[kind]} {NAMES[kind]}{_of_period(kind, period)}",
+            **curve_look(kind, period, periods),
         )
         seen.setdefault((period, kind), line)
     style.label_axes(
@@ -401,12 +391,6 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     style.legend_above(fig, [seen[key] for key in sorted(seen)], size=fig.look.tick)
     style.finish(fig)
     return fig
-
-
-def _of_period(kind: str, period: int) -> str:
-    if kind == HOMOCLINIC:
-        return ""
-    return f", period {period}" if period else ", equilibrium"
 
 
 def draw_curves(run: OpenRun, options: CurveFigureOptions) -> style.DataFigure:

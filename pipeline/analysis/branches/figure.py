@@ -396,6 +396,29 @@ _STYLE_NAMES = dict(zip(DASHES, ("solid:", "dashed:", "dotted:", "dash-dotted:",
 _STYLE_NAMES[_ON_MAP[HOMOCLINIC]] = "short-dashed:"
 
 
+_CURVE_COLOURS = {
+    **dict(zip(KINDS[:3], (style.BLUE, style.VERMILLION, style.GREEN), strict=True)),
+    HOPF: style.ORANGE,
+    HOMOCLINIC: "black",
+    **dict.fromkeys(BRANCH_POINTS, style.PURPLE),
+}
+
+
+def curve_look(kind: str, period: int, periods: Sequence[int]) -> dict[str, Any]:
+    """Return the colour, the dashes and the label of a curve; `periods` are those of all curves, in their order."""
+    return {
+        "color": _CURVE_COLOURS[kind],
+        "linestyle": DASHES[periods.index(period) % len(DASHES)],
+        "label": f"{LABELS[kind]} {NAMES[kind]}{_of_period(kind, period)}",
+    }
+
+
+def _of_period(kind: str, period: int) -> str:
+    if kind == HOMOCLINIC:
+        return ""
+    return f", period {period}" if period else ", equilibrium"
+
+
 def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> bool:
     """Reserve the place of a short name on axes. Return False if it would overlap a name already placed."""
     room = (0.045, 0.045)  # room that a short name takes, in units of the axes
