@@ -39,7 +39,7 @@ _GREYS = {"none": "0.8", "not seen": "1.0"}
 
 _HATCH: dict[str, Any] = {"hatch": "/////", "edgecolor": "0.7", "linewidth": 0.0, "hatch_linewidth": 0.5}
 _LINE: dict[str, Any] = {"color": "0.15", "linewidth": 0.9, "linestyle": (0, (1, 1.4))}
-_MARK: dict[str, Any] = {"markersize": 4.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "color": "0.15"}
+_MARK: dict[str, Any] = {"markersize": 4.0, "markerfacecolor": "white", "markeredgewidth": 0.7}
 
 
 _ROOM = 0.6
@@ -214,7 +214,7 @@ def _marker_of(kind: str) -> str:
 def _line_entries(ds: xr.Dataset) -> list[palette.Entry]:
     kinds = sorted({*_kinds_of_lines(ds)} - {UNDECIDED})
     texts = {kind: EVENTS[kind].text if kind in EVENTS else plain(kind) for kind in kinds}
-    return [Line2D([], [], marker=_marker_of(kind), label=texts[kind], **_LINE, **_MARK) for kind in kinds]
+    return [Line2D([], [], marker=_marker_of(kind), label=f"{texts[kind]}, on no curve", **_LINE, **_MARK) for kind in kinds]
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset) -> None:
@@ -263,11 +263,11 @@ def _name_regions(ax: Axes, ds: xr.Dataset, special: Array, size: float) -> None
     scale = 72.0 / ax.figure.dpi
     named = _on_page(ax, special, scale)[:, None] + [[0.0, 0.0], [0.7 * size, 0.5 * size], [1.6 * size, 0.5 * size]]
     ink = [*(shapely.linestrings(one) for one in named), *_ink(ax, scale)]
-    covered = shapely.buffer(shapely.union_all(np.array(ink, object)), 1.5)
+    covered = shapely.union_all(shapely.buffer(shapely.simplify(np.array(ink, object), 0.25), 1.75))
     window = shapely.box(*np.ravel(ax.get_window_extent().get_points() * scale))
     for number, rings in enumerate(rings_of(ds)):
         text = str(ds["region_label"].values[number])
-        outer, *holes = (_on_page(ax, ring, scale) for ring in rings)
+        outer, *holes = (shapely.linearrings(_on_page(ax, ring, scale)) for ring in rings)
         shape = shapely.intersection(shapely.make_valid(shapely.polygons(outer, holes or None)), window)
         box = np.array([0.5 * size * len(text) + 4.0, size + 4.0])
         free = shapely.transform(shapely.difference(shape, covered), lambda xy, box=box: xy / box)
