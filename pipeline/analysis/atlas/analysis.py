@@ -11,7 +11,7 @@ import xarray as xr
 from pipeline.analysis.atlas.charting import Chart, Located, charted, others_unstable
 from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions, SetEndOptions
 from pipeline.analysis.atlas.effects import Effect, effects_of
-from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End, follow_all
+from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End, at_node, follow_all, start_of
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
 from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, plane_of
 from pipeline.analysis.atlas.regions import variables_of_regions
@@ -21,12 +21,11 @@ from pipeline.analysis.branches.curves import curves_dataset
 from pipeline.analysis.branches.intervals import in_words, swept_axis
 from pipeline.analysis.branches.kinds import HOMOCLINIC, KINDS, SNIC
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.branches.starting_orbits import listed, parameters_at
 from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, UNDECIDED
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import APERIODIC, axis_name, parameters_of
 from pipeline.layout.vocabulary import KINDS as SETS
-from pipeline.results.ragged import ROW_SIZE, SET, padded
+from pipeline.results.ragged import padded
 from pipeline.results.run import OpenRun
 from pipeline.specification.problems import SpecError
 
@@ -69,11 +68,10 @@ def ways(run: OpenRun, options: PlaneOptions) -> list[list[float]]:
 
 
 def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float]]:
-    kinds = plane.sets["kind"].values
     found = []
     for one in changes:
         axis = plane.axis_of(one.edge)
-        if kinds[one.row] not in APERIODIC:
+        if plane.kind[one.row] not in APERIODIC:
             found.append((one.row, axis, float(plane.values[one.there, axis])))
     return found
 
@@ -81,19 +79,15 @@ def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float
 def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[float]]) -> xr.Dataset:
     """Follow orbits that a neighbouring point lacks towards that point."""
     plane = _plane(run, options)
-    base = parameters_of(run.cube())
+    base, starts = parameters_of(run.cube()), []
     ends = [End(UNDECIDED, why="Newton's method found no orbit there")] * len(wanted)
-    rows = np.array([int(one[0]) for one in wanted], int)
-    for axis, name in enumerate(plane.names):
-        own = [k for k, one in enumerate(wanted) if one[1] == axis]
-        there = np.zeros(plane.sets.sizes[SET], bool)
-        there[rows[own]] = True
-        found = listed(plane.sets, base, name, float(plane.size[axis]), there)
-        start = dict(zip(np.flatnonzero(there).tolist(), (one.start for one in found), strict=True))
-        asked = [(k, first) for k in own if (first := start[int(rows[k])]) is not None]
-        followed = follow_all([(first, float(wanted[k][2])) for k, first in asked])
-        for (k, _), end in zip(asked, followed, strict=True):
-            ends[k] = end
+    for k, (row, axis, target) in enumerate(wanted):
+        start = start_of(plane, int(row), int(axis), base)
+        if start is not None:
+            starts.append((k, start, float(target)))
+    followed = follow_all([(start, target) for _, start, target in starts])
+    for (k, _, _), end in zip(starts, followed, strict=True):
+        ends[k] = end
     return _dataset(run, plane, wanted, ends)
 
 
@@ -117,8 +111,7 @@ def set_ends(run: OpenRun, options: SetEndOptions, wanted: Sequence[Sequence[flo
 def _dataset(run: OpenRun, plane: Plane, wanted: Sequence[Sequence[float]], ends: Sequence[End]) -> xr.Dataset:
     """Return ends between neighbouring points as rows."""
     rows, n = np.array([int(one[0]) for one in wanted], int), len(run.model.state_names)
-    node = dict(zip(plane.rows.tolist(), plane.node.tolist(), strict=True))
-    places = plane.values[[node[row] for row in rows.tolist()]].copy()
+    places = plane.values[plane.node[rows]].copy()
     for k, (one, end) in enumerate(zip(wanted, ends, strict=True)):
         places[k, int(one[1])] = end.value
     empty = np.full(n, np.nan)
@@ -169,9 +162,8 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
 
 def _verdicts(run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change]) -> list[Verdict]:
     """Say of each change what explains it: of an orbit where it ends, of another set what names its end."""
-    kinds, system = plane.sets["kind"].values, run.model.system
-    count = iter(range(len(changes)))
-    numbers = [-1 if kinds[one.row] in APERIODIC else next(count) for one in changes]
+    system, count = run.model.system, iter(range(len(changes)))
+    numbers = [-1 if plane.kind[one.row] in APERIODIC else next(count) for one in changes]
     found = verdicts(plane, changes, numbers, run.derive("orbit_ends", **options.part(PlaneOptions)), system)
     lines = set_lines(plane, changes)
     if tested := chosen(lines, options.windows):
@@ -185,8 +177,7 @@ def _verdicts(run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequen
 
 def _family(run: OpenRun, plane: Plane, period: int) -> Family:
     """Return the family of orbits of a period, or of equilibria, with both parameters of the plane free."""
-    corner = plane.sets[[ROW_SIZE]].isel(dict.fromkeys(plane.names, 0))
-    frequency, packed = parameters_at(corner, parameters_of(run.cube()))
+    frequency, packed = at_node(plane, 0, parameters_of(run.cube()))
     scales = (float(plane.size[0]), float(plane.size[1]))
     return Family(run.model.system, period, frequency, packed, plane.names, scales)
 
@@ -200,13 +191,12 @@ def _charted(
         for k, one in enumerate(found)
         if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None and one.period <= options.curve_period
     ]
-    numbers = plane.sets["attractor"].values
     families = {period: _family(run, plane, period) for period in {0, *(found[k].period for k in own)}}
     located = [
         Located(
             families[0 if one.what in (HOMOCLINIC, SNIC) else one.period],
             one.what,
-            int(numbers[change.row]),
+            int(plane.attractor[change.row]),
             np.asarray(one.state),
             one.place,
             one.error if one.error > 1e-6 else 0.0,
@@ -246,9 +236,9 @@ def _agree(changes: Sequence[Change], found: Sequence[Verdict]) -> None:
 def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> list[Line]:
     """Join the changes that lie on no curve, and give each its line."""
     own = [k for k, one in enumerate(found) if one.curve < 0 and one.is_seen and one.what != LIVES_ON]
-    kinds = plane.sets["kind"].values
     items: list[tuple[int, Key, Array]] = [
-        (changes[k].edge, (found[k].what, found[k].period, int(kinds[changes[k].row])), found[k].place) for k in own
+        (changes[k].edge, (found[k].what, found[k].period, int(plane.kind[changes[k].row])), found[k].place)
+        for k in own
     ]
     lines = lines_through(plane, items)
     for number, line in enumerate(lines):
@@ -286,18 +276,17 @@ def _of_lines(lines: Sequence[Line]) -> dict[str, Any]:
 
 def _of_changes(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> dict[str, Any]:
     row, other = (np.array([getattr(one, name) for one in changes], int) for name in ("row", "other"))
-    own = {name: plane.sets[name].values for name in ("attractor", "kind", "orbit_period", "n_cells")}
-    after = np.where(other >= 0, own["orbit_period"][other], -1) if len(row) else row
+    after = np.where(other >= 0, plane.period[other], -1) if len(row) else row
     places = np.array([one.place for one in found]).reshape(-1, 2)
     variables: dict[str, Any] = {
-        "change_attractor": ("change", own["attractor"][row].astype(np.int32)),
-        "change_set": ("change", own["kind"][row].astype(np.int8), code_flags(SETS)),
-        "change_period": ("change", own["orbit_period"][row].astype(np.int32)),
+        "change_attractor": ("change", plane.attractor[row].astype(np.int32)),
+        "change_set": ("change", plane.kind[row].astype(np.int8), code_flags(SETS)),
+        "change_period": ("change", plane.period[row].astype(np.int32)),
         "period_after": ("change", after.astype(np.int32)),
         "what": ("change", np.array([WHATS.index(one.what) for one in found], np.int8), code_flags(WHATS)),
         "on_curve": ("change", np.array([one.curve for one in found], np.int32)),
         "on_line": ("change", np.array([one.line for one in found], np.int32)),
-        "change_cells": ("change", own["n_cells"][row].astype(np.int32)),
+        "change_cells": ("change", plane.cells[row].astype(np.int32)),
         "why": ("change", np.array([one.why for one in found], object)),
         "change_error": ("change", np.array([one.error for one in found], float)),
     }

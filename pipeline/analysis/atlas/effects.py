@@ -14,7 +14,6 @@ from pipeline.analysis.atlas.verdicts import Verdict, met_at, rows_at
 from pipeline.analysis.branches.curves import Curve
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, HOMOCLINIC
 from pipeline.analysis.events.kinds import LIVES_ON
-from pipeline.results.ragged import points_of_rows
 from pipeline.results.tabular import counted
 
 LOOKED_AT = 8
@@ -138,7 +137,7 @@ def _silence(plane: Plane, curve: Curve, crossed: Crossings, own: Sequence[int])
         ends = plane.values[plane.edges[crossed.edge[k]], axis]
         here = np.append(u[:n], values[axis] / family.scales[axis])
         places.append((along, here, (float(ends[0]), float(ends[1]))))
-    points, rows = points_of_rows(plane.sets), rows_at(plane)
+    rows = rows_at(plane)
     told: Counter[str] = Counter()
     for k, found in zip(chosen, beside_all(places), strict=True):
         nodes = plane.edges[crossed.edge[k]]
@@ -146,7 +145,7 @@ def _silence(plane: Plane, curve: Curve, crossed: Crossings, own: Sequence[int])
         for one in reached:
             axis = plane.axis_of(crossed.edge[k])
             node = nodes[int(np.argmin(np.abs(plane.values[nodes, axis] - one.value)))]
-            is_met = met_at(points, rows[node], np.asarray(one.state), curve.family.system) >= 0
+            is_met = met_at(plane.points, rows[node], np.asarray(one.state), curve.family.system) >= 0
             told["the stable orbit is met on its side" if is_met else "no cell finds the stable orbit"] += 1
         if not reached:
             told["the stable orbit ends before the next point" if found else "no stable orbit could be followed"] += 1

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magpend_core.equilibria import is_held
+from magpend_core.models.model import Parameters
+from pipeline.analysis.atlas.plane import Plane
 from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
 from pipeline.analysis.branches.bifurcations import Bifurcation, n_unstable
 from pipeline.analysis.branches.exploring import first_of
@@ -17,9 +20,11 @@ from pipeline.analysis.branches.limits import settle_limits
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.starting_orbits import family_of
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.kinds import LIVES_ON, UNDECIDED
 from pipeline.analysis.events.lines import Line
+from pipeline.layout.vocabulary import EQUILIBRIUM, frequency_of
 
 TRACE = Settings(beyond=2)
 """Settings of the branches: they end soon beyond the stable part."""
@@ -41,6 +46,27 @@ class End:
     period: int = 0  # of the orbit at the bifurcation
     state: np.ndarray | None = None  # a section point of it, or of the orbit at the neighbouring point
     why: str = ""
+
+
+def at_node(plane: Plane, node: int, base: Parameters) -> tuple[float, np.ndarray]:
+    """Return the drive frequency [Hz] and the packed parameters at a point of the plane."""
+    scalars = {str(name): float(v) for name, v in plane.sets.coords.items() if not v.ndim and v.dtype.kind == "f"}
+    scalars |= dict(zip(plane.names, plane.values[node].tolist(), strict=True))
+    own = {name: value for name, value in scalars.items() if name in base.names}
+    return frequency_of(base.model, scalars), base.replace(**own).pack()
+
+
+def start_of(plane: Plane, row: int, axis: int, base: Parameters) -> Start | None:
+    """Return an attractor as the start of a branch along one parameter; None if it is no refined orbit."""
+    system, state, period = base.model.system, plane.points[row][0], int(plane.period[row])
+    frequency, packed = at_node(plane, int(plane.node[row]), base)
+    is_rest = plane.kind[row] == EQUILIBRIUM
+    if is_rest and system.section is None and is_held(system, state, packed):
+        period = 1  # its rates do not vanish, but the map at instants leaves it in place
+    if not plane.is_polished[row] or not (period or is_rest):
+        return None
+    family = family_of(system, period, frequency, packed, plane.names[axis], float(plane.size[axis]))
+    return Start(family, state, float(plane.values[plane.node[row], axis]), int(plane.attractor[row]))
 
 
 def follow_all(starts: Sequence[tuple[Start, float]], what: str = "") -> list[End]:

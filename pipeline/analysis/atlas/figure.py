@@ -214,7 +214,9 @@ def _marker_of(kind: str) -> str:
 def _line_entries(ds: xr.Dataset) -> list[palette.Entry]:
     kinds = sorted({*_kinds_of_lines(ds)} - {UNDECIDED})
     texts = {kind: EVENTS[kind].text if kind in EVENTS else plain(kind) for kind in kinds}
-    return [Line2D([], [], marker=_marker_of(kind), label=f"{texts[kind]}, on no curve", **_LINE, **_MARK) for kind in kinds]
+    return [
+        Line2D([], [], marker=_marker_of(kind), label=f"{texts[kind]}, on no curve", **_LINE, **_MARK) for kind in kinds
+    ]
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset) -> None:

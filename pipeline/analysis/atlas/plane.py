@@ -33,17 +33,23 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Attractors at the points (nodes) of a plane, and the pairs of neighbouring points (edges)."""
+    """Attractors (rows) at the points (nodes) of a plane, and the pairs of neighbouring points (edges)."""
 
     names: tuple[str, str]  # axes
     shape: tuple[int, int]  # numbers of values along them
-    values: Array  # parameter values of the nodes, (node, 2); the second parameter varies first
+    values: Array  # parameter values of the nodes, (node, 2): those of the grid, the second first, then further ones
     edges: Array  # (edge, 2): two neighbours, the one with the larger value last
-    sets: xr.Dataset  # result with rows of sets, of the two axes alone
-    rows: Array  # rows of attractors
-    node: Array  # node of each of these
     n_cells: Array  # (node,): cells
     n_known: Array  # (node,): cells with a known outcome
+    sets: xr.Dataset  # the sets on the grid
+    # of each row
+    node: Array
+    attractor: Array  # id
+    kind: Array
+    period: Array
+    cells: Array  # number of cells on it
+    is_polished: Array
+    points: list[Array]  # section points, (any, state)
 
     @property
     def low(self) -> Array:
@@ -85,11 +91,26 @@ def plane_of(found: xr.Dataset, names: tuple[str, str], at: Mapping[str, float] 
     values = np.stack(np.meshgrid(*(np.sort(one) for one in axes), indexing="ij"), axis=-1).reshape(-1, 2)
     is_known = (outcomes(part) != -1).transpose(*names, ...).values.reshape(*shape, -1)
     known = is_known.sum(axis=-1)[np.ix_(*order)].ravel()
-    n_cells = np.full(len(known), is_known.shape[-1])
     edges = [np.stack([number[:-1].ravel(), number[1:].ravel()], axis=-1)]
     edges += [np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=-1)]
-    node = own.ravel()[point_of_rows(part)[rows]]
-    return Plane(names, shape, values, np.concatenate(edges), part, rows, node, n_cells, known)
+    return Plane(
+        names,
+        shape,
+        values,
+        np.concatenate(edges),
+        np.full(len(known), is_known.shape[-1]),
+        known,
+        part,
+        own.ravel()[point_of_rows(part)[rows]],
+        *columns_of(part, rows),
+    )
+
+
+def columns_of(part: xr.Dataset, rows: Array) -> tuple[Any, ...]:
+    """Return of some sets the id, kind, period, number of cells, whether it is refined, and the section points."""
+    names = ["attractor", "kind", "orbit_period", "n_cells", "is_polished"]
+    points = points_of_rows(part)
+    return (*(part[name].values[rows] for name in names), [points[row] for row in rows.tolist()])
 
 
 def changes_of(plane: Plane, system: System) -> list[Change]:
@@ -98,11 +119,10 @@ def changes_of(plane: Plane, system: System) -> list[Change]:
     Around a cusp one id passes from one sheet of orbits to the other. So an orbit that moves between two points by more
     than beside them is listed as well: it may have jumped.
     """
-    numbers, kinds, periods = (plane.sets[name].values for name in ("attractor", "kind", "orbit_period"))
     at: list[dict[int, int]] = [{} for _ in range(len(plane.values))]
-    for row, node in zip(plane.rows.tolist(), plane.node.tolist(), strict=True):
-        at[node][int(numbers[row])] = row
-    alike = np.stack([kinds, periods], axis=-1).tolist()
+    for row, (node, number) in enumerate(zip(plane.node.tolist(), plane.attractor.tolist(), strict=True)):
+        at[node][number] = row
+    alike = np.stack([plane.kind, plane.period], axis=-1).tolist()
     found: list[Change] = []
     pairs: list[Change] = []
     for edge, (a, b) in enumerate(plane.edges.tolist()):
@@ -112,7 +132,7 @@ def changes_of(plane: Plane, system: System) -> list[Change]:
                 found.append(Change(edge, b, a, rows[1], -1))
             elif rows[1] < 0 or alike[rows[0]] != alike[rows[1]]:
                 found += _both_ways(edge, a, b, rows)
-            elif kinds[rows[0]] not in APERIODIC:
+            elif plane.kind[rows[0]] not in APERIODIC:
                 pairs.append(Change(edge, a, b, *rows))
     return sorted([*found, *_jumps(plane, pairs, system)])
 
@@ -145,11 +165,10 @@ def _jumps(plane: Plane, pairs: Sequence[Change], system: System) -> list[Change
 
 def _moves(plane: Plane, pairs: Sequence[Change], system: System) -> list[tuple[Array, int]]:
     """Return the scaled move of each orbit to its neighbour (phase, state), and the shift of phases to it."""
-    points, periods = points_of_rows(plane.sets), plane.sets["orbit_period"].values
     scales, found = np.asarray(system.scales), []
     for one in pairs:
-        phases = max(int(periods[one.row]), 1)
-        here, there = points[one.row][:phases], points[one.other][:phases]
+        phases = max(int(plane.period[one.row]), 1)
+        here, there = plane.points[one.row][:phases], plane.points[one.other][:phases]
         shift = int(np.linalg.norm(wrap_angles(there - here[0], system) / scales, axis=-1).argmin())
         found.append((wrap_angles(np.roll(there, -shift, axis=0) - here, system) / scales, shift))
     return found

@@ -17,7 +17,6 @@ from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.results.intervals import binomial_interval
-from pipeline.results.ragged import SET
 from pipeline.results.tabular import plain
 
 SEEN = 299
@@ -90,13 +89,12 @@ def _regions(plane: Plane, found: Arrangement, region: Array) -> dict[str, Any]:
 
 def _names(plane: Plane, region: Array, n: int) -> list[str]:
     """Return the attractors that most points of a region have, as a text."""
-    kinds, periods = (plane.sets[name].values[plane.rows] for name in ("kind", "orbit_period"))
     names = []
     for number in range(n):
         nodes = np.flatnonzero(region == number)
         own = np.isin(plane.node, nodes)
         sets: dict[int, list[tuple[int, int]]] = {int(node): [] for node in nodes}
-        for node, kind, period in zip(plane.node[own], kinds[own], periods[own], strict=True):
+        for node, kind, period in zip(plane.node[own], plane.kind[own], plane.period[own], strict=True):
             sets[int(node)].append((int(kind), int(period)))
         common = Counter(tuple(sorted(one)) for one in sets.values()).most_common(1)
         names.append(" + ".join(_name(*one) for one in common[0][0]) if common else "not seen")
@@ -111,30 +109,26 @@ def _name(kind: int, period: int) -> str:
 
 def _members(plane: Plane, region: Array, same: Array) -> dict[str, Any]:
     """Return the attractors of each region: rows in it that have one id, or are known to be one."""
-    own = {name: plane.sets[name].values[plane.rows] for name in ("attractor", "kind", "orbit_period", "n_cells")}
     where = region[plane.node]
-    place = np.full(plane.sets.sizes[SET], -1)
-    place[plane.rows] = np.arange(len(plane.rows))
-    pairs = place[same]
-    pairs = pairs[where[pairs[:, 0]] == where[pairs[:, 1]]]
-    order = np.lexsort((own["attractor"], where))
-    is_same = (np.diff(where[order]) == 0) & (np.diff(own["attractor"][order]) == 0)
+    pairs = same[where[same[:, 0]] == where[same[:, 1]]]
+    order = np.lexsort((plane.attractor, where))
+    is_same = (np.diff(where[order]) == 0) & (np.diff(plane.attractor[order]) == 0)
     pairs = np.concatenate([pairs, np.stack([order[:-1], order[1:]], axis=-1)[is_same]])
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(where),) * 2)
     n, which = connected_components(links, directed=False)
     first = np.full(n, len(where))
     np.minimum.at(first, which, np.arange(len(where)))
-    order = np.lexsort((own["attractor"][first], where[first]))
+    order = np.lexsort((plane.attractor[first], where[first]))
     first, which = first[order], np.argsort(order)[which]
-    cells = np.bincount(which, own["n_cells"], minlength=n)
+    cells = np.bincount(which, plane.cells, minlength=n)
     total = np.maximum(np.bincount(region, plane.n_cells, minlength=int(region.max(initial=0)) + 1)[where[first]], 1)
     low, high = binomial_interval(cells, total)
     points = [len(np.unique(plane.node[which == k])) for k in range(n)]
     return {
         "of_region": ("member", where[first].astype(np.int32)),
-        "member_attractor": ("member", own["attractor"][first].astype(np.int32)),
-        "member_set": ("member", own["kind"][first].astype(np.int8), code_flags(SETS)),
-        "member_period": ("member", own["orbit_period"][first].astype(np.int32)),
+        "member_attractor": ("member", plane.attractor[first].astype(np.int32)),
+        "member_set": ("member", plane.kind[first].astype(np.int8), code_flags(SETS)),
+        "member_period": ("member", plane.period[first].astype(np.int32)),
         "member_points": ("member", np.array(points, np.int32)),
         "member_share": ("member", cells / total),
         "member_share_low": ("member", low),

@@ -14,7 +14,6 @@ from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS
 from pipeline.analysis.atlas.plane import Array, Change, Plane
 from pipeline.analysis.branches.kinds import HOPF
 from pipeline.analysis.events.kinds import LIVES_ON, UNDECIDED
-from pipeline.results.ragged import points_of_rows
 
 SAME = 1e-4
 """Scaled distance within which two stable orbits at one point are one: both are refined to far less."""
@@ -64,7 +63,7 @@ def verdicts(
     words = str(ends["what"].attrs["flag_meanings"]).split()
     whats = [words[code] for code in ends["what"].values.tolist()]
     places = np.stack([ends["end_first"].values, ends["end_second"].values], axis=-1)
-    points, node_rows = points_of_rows(plane.sets), rows_at(plane)
+    node_rows = rows_at(plane)
     found = []
     for change, k in zip(changes, numbers, strict=True):
         middle = plane.values[[change.here, change.there]].mean(axis=0)
@@ -77,7 +76,7 @@ def verdicts(
         if what == UNDECIDED:
             found.append(Verdict(UNDECIDED, middle, half, why))
         elif what == LIVES_ON:
-            row = met_at(points, node_rows[change.there], state, system)
+            row = met_at(plane.points, node_rows[change.there], state, system)
             found.append(Verdict(LIVES_ON if row < 0 else GOES_ON, middle, half, why, period, state, row=row))
         else:
             error = float(ends["end_error"].values[k])
@@ -96,7 +95,7 @@ def met_at(points: Sequence[Array], rows: Sequence[int], state: Array, system: S
 def rows_at(plane: Plane) -> list[list[int]]:
     """Return the rows of the attractors at each node."""
     rows: list[list[int]] = [[] for _ in plane.values]
-    for row, node in zip(plane.rows.tolist(), plane.node.tolist(), strict=True):
+    for row, node in enumerate(plane.node.tolist()):
         rows[node].append(row)
     return rows
 

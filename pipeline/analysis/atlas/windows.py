@@ -25,14 +25,13 @@ NO_WINDOW = "a set that is no orbit; it was named at no place of its line (--win
 
 def set_lines(plane: Plane, changes: Sequence[Change]) -> list[Line]:
     """Join the changes of sets that are no orbits to lines; their items are numbers of changes."""
-    kinds, periods = plane.sets["kind"].values, plane.sets["orbit_period"].values
-    own = [k for k, one in enumerate(changes) if kinds[one.row] in APERIODIC]
+    own = [k for k, one in enumerate(changes) if plane.kind[one.row] in APERIODIC]
     items = []
     for k in own:
         one = changes[k]
-        after = int(periods[one.other]) if one.other >= 0 else -1
+        after = int(plane.period[one.other]) if one.other >= 0 else -1
         middle = plane.values[[one.here, one.there]].mean(axis=0)
-        items.append((one.edge, ("", int(kinds[one.row]), after), middle))
+        items.append((one.edge, ("", int(plane.kind[one.row]), after), middle))
     return [
         Line(one.what, one.period, one.places, tuple(own[i] for i in one.items)) for one in lines_through(plane, items)
     ]
@@ -51,7 +50,7 @@ def chosen(lines: Sequence[Line], n: int) -> list[int]:
 def named(plane: Plane, row: int, axis: int, target: float, base: Parameters) -> End:
     """Name the end of a set between its point and a neighbour, by the events in a window around both."""
     name, other = plane.names[axis], plane.names[1 - axis]
-    here = plane.values[plane.node[np.flatnonzero(plane.rows == row)[0]]]
+    here = plane.values[plane.node[row]]
     along = np.unique(plane.values[:, axis])
     ends = np.searchsorted(along, sorted((here[axis], target)))
     inside = along[max(ends[0] - BESIDE, 0) : ends[1] + BESIDE + 1]
@@ -59,7 +58,7 @@ def named(plane: Plane, row: int, axis: int, target: float, base: Parameters) ->
     line = int(np.flatnonzero(plane.sets[other].values == here[1 - axis])[0])
     part = isel(plane.sets, {name: places, other: line})
     found = events_within(part, parameter_name(name), base, float(plane.size[axis]))
-    number, rises = int(plane.sets["attractor"].values[row]), int(target > here[axis])
+    number, rises = int(plane.attractor[row]), int(target > here[axis])
     seen = found["seen"].values == here[axis]
     own = np.flatnonzero(seen & (found["attractor"].values == number) & (found["rises"].values == rises))
     if not len(own):

@@ -374,10 +374,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     for i in range(ds.sizes["curve"]):
         n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), CURVE_KINDS[int(ds["kind"][i])]
         (line,) = ax.plot(
-            ds["first"].values[i, :n],
-            ds["second"].values[i, :n],
-            linewidth=1.2,
-            **curve_look(kind, period, periods),
+            ds["first"].values[i, :n], ds["second"].values[i, :n], linewidth=1.2, **curve_look(kind, period, periods)
         )
         seen.setdefault((period, kind), line)
     style.label_axes(

@@ -34,9 +34,7 @@ class Listed:
     is_cycle: bool = False
 
 
-def listed(
-    attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float, there: np.ndarray | None = None
-) -> Iterator[Listed]:
+def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
     """Yield the attractors of a run. An attractor that Newton's method has refined comes with a starting orbit for a
     branch.
 
@@ -50,13 +48,8 @@ def listed(
         Parameter to continue.
     scale
         Change of the parameter that counts as 1.
-    there
-        Mask of the rows that are wanted; by default all.
     """
-    rows = points_of_rows(attractors)
-    if there is not None:
-        rows = [rows[k] for k in np.flatnonzero(there)]
-    for (where, one), points in zip(sets_of(attractors, there), rows, strict=True):
+    for (where, one), points in zip(sets_of(attractors), points_of_rows(attractors), strict=True):
         frequency, packed = parameters_at(one, parameters)
         number, kind, period = (int(one[name]) for name in ("attractor", "kind", "orbit_period"))
         start = None
