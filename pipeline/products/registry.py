@@ -187,6 +187,7 @@ _FOR_OTHERS: Groups = {
         "identified": (f"{_room('attractors')}:IDENTIFIED", ""),
         "orbit_ends": (f"{_room('atlas')}:ORBIT_ENDS", ""),
         "set_ends": (f"{_room('atlas')}:SET_ENDS", ""),
+        "further": (f"{_room('atlas')}:FURTHER", ""),
     }
 }
 

@@ -12,6 +12,8 @@ from pipeline.analysis.atlas.charting import Chart, Located, charted, others_uns
 from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions, SetEndOptions
 from pipeline.analysis.atlas.effects import Effect, effects_of
 from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End, at_node, follow_all, start_of
+from pipeline.analysis.atlas.further import Wanted, wanted, with_further
+from pipeline.analysis.atlas.further import dataset_of as further_dataset
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
 from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, plane_of
 from pipeline.analysis.atlas.regions import variables_of_regions
@@ -55,7 +57,33 @@ def settle_plane(run: OpenRun, options: Given) -> Given:
 
 
 def _plane(run: OpenRun, options: PlaneOptions) -> Plane:
-    return plane_of(run.derive("attractors"), (axis_name(options.parameter), axis_name(options.second)), options.at)
+    """Return the plane of a run, with its further points."""
+    plane = plane_of(run.derive("attractors"), (axis_name(options.parameter), axis_name(options.second)), options.at)
+    if not options.budget:
+        return plane
+    more = run.derive("further", **options.part(PlaneOptions))
+    return with_further(plane, more, run.model.system) if more.sizes["further"] else plane
+
+
+def further(run: OpenRun, options: PlaneOptions) -> xr.Dataset:
+    """Run further points until the budget is spent or none is wanted, each round where the atlas is worst by then."""
+    points: list[Wanted] = []
+    spent = 0
+    while spent < options.budget:
+        before = options.model_copy(update={"budget": spent})
+        ds = run.derive("atlas", **before.part(PlaneOptions))
+        more = wanted(_plane(run, before), ds, ds["node_region"].values, options.budget - spent)
+        if not more:
+            break
+        points += more
+        spent += sum(one.n_starts for one in more)
+    names = axis_name(options.parameter), axis_name(options.second)
+    places = [{**dict(zip(names, one.values, strict=True)), **options.at} for one in points]
+    found = run.at_points(places, [one.n_starts for one in points]) if points else []
+    n = sum(one.n_starts for one in points)
+    run.echo(f"atlas: {len(points)} further points with {n} cells")
+    ds = further_dataset(points, [one.derive("identified") for one in found], run.model.state_names)
+    return ds.assign_attrs(first_parameter=names[0], second_parameter=names[1])
 
 
 # ---- ends of orbits ----------------------------------------------------------------------------
@@ -237,7 +265,11 @@ def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) ->
     """Join the changes that lie on no curve, and give each its line."""
     own = [k for k, one in enumerate(found) if one.curve < 0 and one.is_seen and one.what != LIVES_ON]
     items: list[tuple[int, Key, Array]] = [
-        (changes[k].edge, (found[k].what, found[k].period, int(plane.kind[changes[k].row])), found[k].place)
+        (
+            int(plane.parent[changes[k].edge]),
+            (found[k].what, found[k].period, int(plane.kind[changes[k].row])),
+            found[k].place,
+        )
         for k in own
     ]
     lines = lines_through(plane, items)

@@ -15,6 +15,12 @@ class PlaneOptions(Options):
     parameter: str = option("", "First parameter, along the horizontal axis; by default the run's first axis.")
     second: str = option("", "Second parameter, along the vertical axis; by default the run's other axis.")
     at: dict[str, float] = option({}, "Value of a further axis of the run.")
+    budget: int = option(
+        0,
+        "Most cells at further points, beside the run: between neighbours whose orbits end without an explanation, and "
+        "in regions where fewer than 299 cells are known.",
+        ge=0,
+    )
 
 
 class SetEndOptions(PlaneOptions):
@@ -61,6 +67,38 @@ ENDS_COLUMNS: Columns = (
     ),
     *_plane("end", "end", "place of the end"),
     *over("end state", STATES, end_section="a section point there"),
+)
+
+FURTHER_COLUMNS: Columns = (
+    *_plane("point", "further", "further point"),
+    *over(
+        "further",
+        at_node="point of the grid at which it has more starts, -1 none",
+        point_cells="cells",
+        point_known="cells with a known outcome",
+    ),
+    *over("further side", between_nodes="points between which it lies, -1 none"),
+    *over(
+        "set",
+        of_point="further point",
+        set_kind="kind of the attractor",
+        set_period="period of the attractor, 0 none",
+        set_cells="cells on it",
+        set_is_polished="whether Newton's method converged",
+        set_points="stored section points",
+    ),
+    *over("sample state", STATES, further_section="section points"),
+)
+
+FURTHER = Analysis(
+    "further",
+    "Run further parameter points where an atlas is worst, and find their attractors.",
+    PlaneOptions,
+    compute=f"{_ROOM}:further",
+    whole="it runs points beside the run, whose cells are spread over all workers",
+    columns=FURTHER_COLUMNS,
+    settle=f"{_ROOM}:settle_plane",
+    builds_on=("attractors",),
 )
 
 ORBIT_ENDS = Analysis(
@@ -125,6 +163,7 @@ ATLAS_COLUMNS: Columns = (
         region_label="periods of its attractors",
     ),
     *_plane("label", "region", "point well inside"),
+    *over("node", node_region="region of a parameter point, the second parameter varying first; further points last"),
     *over(
         "member",
         of_region="region",

@@ -105,7 +105,7 @@ def effects_of(
     for number, curve in enumerate(curves):
         own = [k for k, one in enumerate(crossed.curve) if one == number]
         edges = {crossed.edge[k] for k in own}
-        changed = {c.edge for c, v in zip(changes, found, strict=True) if v.curve == number}
+        changed = {int(plane.parent[c.edge]) for c, v in zip(changes, found, strict=True) if v.curve == number}
         why = ""
         if not changed:
             why = UNSTABLE if not stable[number].any() else NOT_CROSSED

@@ -38,7 +38,9 @@ class Plane:
     names: tuple[str, str]  # axes
     shape: tuple[int, int]  # numbers of values along them
     values: Array  # parameter values of the nodes, (node, 2): those of the grid, the second first, then further ones
-    edges: Array  # (edge, 2): two neighbours, the one with the larger value last
+    edges: Array  # (edge, 2): two neighbours, the one with the larger value last; those of the grid first
+    parent: Array  # (edge,): edge of the grid on which it lies
+    is_parted: Array  # (edge,): whether further points part it
     n_cells: Array  # (node,): cells
     n_known: Array  # (node,): cells with a known outcome
     sets: xr.Dataset  # the sets on the grid
@@ -98,6 +100,8 @@ def plane_of(found: xr.Dataset, names: tuple[str, str], at: Mapping[str, float] 
         shape,
         values,
         np.concatenate(edges),
+        np.arange(sum(map(len, edges))),
+        np.zeros(sum(map(len, edges)), bool),
         np.full(len(known), is_known.shape[-1]),
         known,
         part,
@@ -125,7 +129,8 @@ def changes_of(plane: Plane, system: System) -> list[Change]:
     alike = np.stack([plane.kind, plane.period], axis=-1).tolist()
     found: list[Change] = []
     pairs: list[Change] = []
-    for edge, (a, b) in enumerate(plane.edges.tolist()):
+    for edge in np.flatnonzero(~plane.is_parted).tolist():
+        a, b = plane.edges[edge].tolist()
         for number in sorted(at[a].keys() | at[b].keys()):
             rows = at[a].get(number, -1), at[b].get(number, -1)
             if rows[0] < 0:

@@ -11,16 +11,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.analysis.atlas.arrangement import Arrangement, arranged
+from pipeline.analysis.atlas.further import SEEN
 from pipeline.analysis.atlas.lines import Line
 from pipeline.analysis.atlas.plane import Array, Plane
+from pipeline.analysis.events.kinds import UNDECIDED
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.tabular import plain
-
-SEEN = 299
-"""Fewest cells of which one is in a basin of 1 % with a probability of 95 %: ln .05 / ln .99."""
 
 _LEAST_TOLERANCE = 1e-6
 
@@ -47,7 +46,7 @@ def variables_of_regions(
             owner.append(number)
             parts.append(part)
     for number, line in enumerate(lines, len(tracks)):
-        if len(line.places) > 1:
+        if len(line.places) > 1 and line.what != UNDECIDED:
             owner.append(number)
             parts.append(plane.scaled(line.places))
     tolerances = [_bend(part) for part in parts]
@@ -84,6 +83,7 @@ def _regions(plane: Plane, found: Arrangement, region: Array) -> dict[str, Any]:
         "label_first": ("region", labels[:, 0]),
         "label_second": ("region", labels[:, 1]),
         "region_label": ("region", np.array(_names(plane, region, n), object)),
+        "node_region": ("node", region.astype(np.int32)),
     }
 
 

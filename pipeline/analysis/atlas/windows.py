@@ -31,7 +31,7 @@ def set_lines(plane: Plane, changes: Sequence[Change]) -> list[Line]:
         one = changes[k]
         after = int(plane.period[one.other]) if one.other >= 0 else -1
         middle = plane.values[[one.here, one.there]].mean(axis=0)
-        items.append((one.edge, ("", int(plane.kind[one.row]), after), middle))
+        items.append((int(plane.parent[one.edge]), ("", int(plane.kind[one.row]), after), middle))
     return [
         Line(one.what, one.period, one.places, tuple(own[i] for i in one.items)) for one in lines_through(plane, items)
     ]
