@@ -113,6 +113,7 @@ ANALYSES = {
     "backbone": "walk --undamped damping=0 --undamped amplitude=0",
     "sensitivities": "walk --deviation damping=0.01",
     "curves": "walk --second amplitude --second-from 0.25 --second-to 0.35",
+    "atlas": "sweep",
     "orbits": f"sweep {POINT} --period 1 --starts 40",
     "resilience": f"sweep {LINE} --directions 8 --confirmations 8 --phases 2 --timed 8",
     "tipping": "ramp --settle 60 --interval 0.1",

@@ -34,6 +34,7 @@ FORMATS = (
     Format("*.nc", "NetCDF", "pipeline.runs.exporting:netcdf_content"),
     Format("*.mat", "MATLAB and Octave", "pipeline.results.matlab:matlab_bytes"),
     Format("*.dat", "a time series from which AUTO starts", "pipeline.runs.auto_files:start_text"),
+    Format("*.geojson", "GeoJSON, the shapes of an atlas", "pipeline.analysis.atlas.geojson:geojson_text"),
     Format("b.*", "AUTO's table of branches", "pipeline.runs.auto_files:branches_text"),
 )
 """Formats; the first whose pattern a name has is taken."""

@@ -203,6 +203,7 @@ PARTS = {
     "sensitivities": {"parameter": "amplitude", "deviation": {"damping": 0.01}},
     "bands": {"parameter": "amplitude", "posterior": "posterior.nc"},
     "phase": {"phases": 16},
+    "orbit_ends": {"parameter": "frequency_hz", "second": "amplitude"},
 }
 CYCLES = """
 kind = "sweep"
