@@ -16,7 +16,7 @@ from pipeline.analysis.branches.kinds import BRANCH_POINTS, HOMOCLINIC
 from pipeline.analysis.events.kinds import LIVES_ON
 from pipeline.results.tabular import counted
 
-LOOKED_AT = 8
+FOLLOWED_BACK = 8
 """Places of a curve without an effect at which the orbits beside it are followed to the neighbouring points."""
 
 UNSTABLE = "its orbits are unstable on both sides"
@@ -118,7 +118,7 @@ def _silence(plane: Plane, curve: Curve, crossed: Crossings, own: Sequence[int])
     """Follow the stable orbits beside a curve to the neighbouring points, and say why no change was seen there."""
     if curve.kind in (HOMOCLINIC, *BRANCH_POINTS):
         return "not followed from this kind of point"
-    chosen = [own[int(k)] for k in np.unique(np.linspace(0, len(own) - 1, LOOKED_AT).round())]
+    chosen = [own[int(k)] for k in np.unique(np.linspace(0, len(own) - 1, FOLLOWED_BACK).round())]
     places = []
     for k in chosen:
         a, b = curve.points[crossed.segment[k] : crossed.segment[k] + 2]

@@ -25,7 +25,7 @@ from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import counted, plain, words_of
 
-TINT = 0.55
+REGION_TINT = 0.55
 """Share of white in the tints of regions: any two of the twelve differ by 6 or more, measured as in `palette`."""
 
 LEAST_AREA = 0.002
@@ -114,7 +114,7 @@ def _tints(ds: xr.Dataset) -> dict[str, Any]:
     """Return the tint of each label of a region: the labels with the largest areas have the colours of the style."""
     total = _areas(ds)
     own = [name for name, area in total.items() if name not in _GREYS and area >= LEAST_AREA]
-    tints = {name: style.tinted(colour, TINT) for name, colour in zip(own, style.colours(), strict=False)}
+    tints = {name: style.tinted(colour, REGION_TINT) for name, colour in zip(own, style.colours(), strict=False)}
     return {name: tints.get(name, _GREYS.get(name, palette.OTHERS)) for name in total}
 
 

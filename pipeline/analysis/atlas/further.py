@@ -14,7 +14,7 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
 from pipeline.analysis.atlas.plane import Array, Plane, columns_of
-from pipeline.analysis.atlas.verdicts import SAME
+from pipeline.analysis.atlas.verdicts import SAME_AT_POINT
 from pipeline.analysis.events.kinds import UNDECIDED
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS
 from pipeline.results.outcomes import outcomes
@@ -165,7 +165,7 @@ def _numbers(plane: Plane, node: Array, points: list[Array], kinds: Array, syste
             alone = len(rows) == 1 and (kinds[node == node[k]] == kind).sum() == 1
             rows = rows if alone else []
         else:
-            rows = [row for row in rows if scaled_distance(plane.points[row], own[0], system).min() < SAME]
+            rows = [row for row in rows if scaled_distance(plane.points[row], own[0], system).min() < SAME_AT_POINT]
         if rows:
             numbers[k] = plane.attractor[rows[0]]
     return numbers

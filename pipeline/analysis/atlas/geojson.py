@@ -60,7 +60,7 @@ def _regions(ds: xr.Dataset) -> Iterator[dict[str, Any]]:
             points=int(one["region_points"]),
             cells=int(one["region_cells"]),
             thin=bool(one["is_thin"]),
-            attractors=[_member(ds, k) for k in np.flatnonzero(ds["of_region"].values == number)],
+            attractors=[_member(ds, k) for k in np.flatnonzero(ds["of_region"].values == number).tolist()],
         )
 
 

@@ -15,7 +15,7 @@ from pipeline.analysis.atlas.plane import Array, Change, Plane
 from pipeline.analysis.branches.kinds import HOPF
 from pipeline.analysis.events.kinds import LIVES_ON, UNDECIDED
 
-SAME = 1e-4
+SAME_AT_POINT = 1e-4
 """Scaled distance within which two stable orbits at one point are one: both are refined to far less."""
 
 
@@ -88,7 +88,7 @@ def verdicts(
 def met_at(points: Sequence[Array], rows: Sequence[int], state: Array, system: System) -> int:
     """Return the row, of some at one point of the plane, of the orbit through a state; -1 if it is none of them."""
     return next(
-        (row for row in rows if len(points[row]) and scaled_distance(points[row], state, system).min() < SAME), -1
+        (row for row in rows if len(points[row]) and scaled_distance(points[row], state, system).min() < SAME_AT_POINT), -1
     )
 
 

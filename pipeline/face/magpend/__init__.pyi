@@ -107,6 +107,7 @@ backbone = Run.backbone
 bands = Run.bands
 sensitivities = Run.sensitivities
 curves = Run.curves
+atlas = Run.atlas
 orbits = Run.orbits
 tongues = Run.tongues
 manifolds = Run.manifolds

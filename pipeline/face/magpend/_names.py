@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from magpend._methods import AnalysisMethod, AnyPanels, Bifurcation, OnePanel, SeveralPanels
+from pipeline.analysis.atlas import declaration as of_atlas
 from pipeline.analysis.attractors import declaration as of_attractors
 from pipeline.analysis.basins import declaration as of_basins
 from pipeline.analysis.branches import declaration as of_branches
@@ -44,6 +45,7 @@ class Analyses:
     bands = AnalysisMethod(of_branches.BandOptions)
     sensitivities = AnalysisMethod(of_branches.SensitivityOptions)
     curves = AnalysisMethod(of_branches.CurveOptions)
+    atlas = AnalysisMethod(of_atlas.AtlasOptions)
     orbits = AnalysisMethod(of_branches.OrbitOptions)
     tongues = AnalysisMethod(of_branches.TongueOptions)
     manifolds = AnalysisMethod(of_manifolds.ManifoldOptions)
@@ -82,6 +84,7 @@ class Figures:
     backbone = OnePanel(of_response.BackboneFigureOptions)
     sensitivities = SeveralPanels(of_branches.SensitivityFigureOptions)
     curves = OnePanel(of_branches.CurveFigureOptions)
+    atlas = OnePanel(of_atlas.AtlasFigureOptions)
     rotation = OnePanel(of_product.FigureOptions)
     tongues = OnePanel(of_branches.TongueFigureOptions)
     manifolds = OnePanel(of_manifolds.ManifoldFigureOptions)
