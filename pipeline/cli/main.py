@@ -17,7 +17,6 @@ import typer
 from magpend_core.troubleshooting import see
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.animate import animate
-from pipeline.cli.atlas import atlas
 from pipeline.cli.common import CommandError
 from pipeline.cli.console import EnoughError, Exit, visible
 from pipeline.cli.extend import extend
@@ -28,7 +27,7 @@ from pipeline.cli.options import VERSION, VERSIONS, drawing
 from pipeline.cli.plot import plot_app
 from pipeline.cli.report import report
 from pipeline.cli.reproduce import reproduce
-from pipeline.cli.running import run, status, submit, verify
+from pipeline.cli.running import atlas, run, status, submit, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.zoom import zoom
 from pipeline.products.plugins import added

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import xarray as xr
 
 from pipeline.analysis.atlas.charting import Chart, Located, charted, others_unstable
+from pipeline.analysis.atlas.dataset import ends_dataset, of_changes, of_curves, of_lines
 from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions, SetEndOptions
-from pipeline.analysis.atlas.effects import Effect, effects_of
-from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End, at_node, follow_all, start_of
+from pipeline.analysis.atlas.effects import effects_of
+from pipeline.analysis.atlas.ends import End, at_node, follow_all, start_of
 from pipeline.analysis.atlas.further import Wanted, wanted, with_further
 from pipeline.analysis.atlas.further import dataset_of as further_dataset
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
@@ -23,18 +24,12 @@ from pipeline.analysis.branches.curves import curves_dataset
 from pipeline.analysis.branches.intervals import in_words, swept_axis
 from pipeline.analysis.branches.kinds import HOMOCLINIC, KINDS, SNIC
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, UNDECIDED
-from pipeline.layout.conventions import code_flags
+from pipeline.analysis.events.kinds import LIVES_ON, UNDECIDED
 from pipeline.layout.vocabulary import APERIODIC, axis_name, parameters_of
-from pipeline.layout.vocabulary import KINDS as SETS
-from pipeline.results.ragged import padded
 from pipeline.results.run import OpenRun
 from pipeline.specification.problems import SpecError
 
 Given = TypeVar("Given", bound=PlaneOptions)
-
-WHATS = (*EVENTS, GOES_ON, SHRINKS, TOUCHES)
-"""What explains a change, in the order of the codes in results."""
 
 MARGIN = 0.06
 """Width beyond the plane up to which curves are followed, in units of the plane: more than their longest step."""
@@ -116,7 +111,7 @@ def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[fl
     followed = follow_all([(start, target) for _, start, target in starts])
     for (k, _, _), end in zip(starts, followed, strict=True):
         ends[k] = end
-    return _dataset(run, plane, wanted, ends)
+    return ends_dataset(plane, wanted, ends, run.model.state_names)
 
 
 def windows(run: OpenRun, options: SetEndOptions) -> list[list[float]]:
@@ -133,29 +128,7 @@ def set_ends(run: OpenRun, options: SetEndOptions, wanted: Sequence[Sequence[flo
     """Name ends of chaotic sets and tori between neighbouring points."""
     plane, base = _plane(run, options), parameters_of(run.cube())
     ends = [named(plane, int(row), int(axis), float(target), base) for row, axis, target in wanted]
-    return _dataset(run, plane, wanted, ends)
-
-
-def _dataset(run: OpenRun, plane: Plane, wanted: Sequence[Sequence[float]], ends: Sequence[End]) -> xr.Dataset:
-    """Return ends between neighbouring points as rows."""
-    rows, n = np.array([int(one[0]) for one in wanted], int), len(run.model.state_names)
-    places = plane.values[plane.node[rows]].copy()
-    for k, (one, end) in enumerate(zip(wanted, ends, strict=True)):
-        places[k, int(one[1])] = end.value
-    empty = np.full(n, np.nan)
-    variables: dict[str, Any] = {
-        "set_row": ("end", rows.astype(np.int32)),
-        "axis": ("end", np.array([int(one[1]) for one in wanted], np.int8)),
-        "what": ("end", np.array([WHATS.index(end.what) for end in ends], np.int8), code_flags(WHATS)),
-        "end_period": ("end", np.array([end.period for end in ends], np.int32)),
-        "end_first": ("end", places[:, 0]),
-        "end_second": ("end", places[:, 1]),
-        "end_error": ("end", [e.error / plane.size[int(w[1])] for w, e in zip(wanted, ends, strict=True)]),
-        "end_section": (("end", "state"), np.array([empty if e.state is None else e.state for e in ends])),
-        "why": ("end", np.array([end.why for end in ends], object)),
-    }
-    attrs = {"first_parameter": plane.names[0], "second_parameter": plane.names[1]}
-    return xr.Dataset(variables, {"state": list(run.model.state_names)}, attrs)
+    return ends_dataset(plane, wanted, ends, run.model.state_names)
 
 
 # ---- the atlas ---------------------------------------------------------------------------------
@@ -181,7 +154,7 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     tracks = [plane.scaled(np.array([c.family.values(p.u) for p in c.points])) for c in chart.curves]
     others = [others_unstable(curve) for curve in chart.curves]
     told = effects_of(plane, changes, found, chart.curves, tracks, [one == 0 for one in others])
-    variables = {**_of_curves(curves, others, told), **_of_lines(lines), **_of_changes(plane, changes, found)}
+    variables = {**of_curves(curves, others, told), **of_lines(lines), **of_changes(plane, changes, found)}
     same = [(change.row, one.row) for change, one in zip(changes, found, strict=True) if one.row >= 0]
     pairs = np.array(same, int).reshape(-1, 2)
     variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines, pairs)
@@ -277,54 +250,3 @@ def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) ->
         for item in line.items:
             found[own[item]].line = number
     return lines
-
-
-# ---- variables ---------------------------------------------------------------------------------
-
-
-def _of_curves(curves: xr.Dataset, others: Sequence[Array], told: Sequence[Effect]) -> dict[str, Any]:
-    unstable = np.full((curves.sizes["curve"], curves.sizes["point"]), -1, np.int8)
-    for one, row in zip(others, unstable, strict=True):
-        row[: len(one)] = one
-    return {
-        "others_unstable": (("curve", "point"), unstable),
-        "n_crossed": ("curve", np.array([one.n_crossed for one in told], np.int32)),
-        "n_effects": ("curve", np.array([one.n_effects for one in told], np.int32)),
-        "effect": ("curve", np.array([one.why for one in told], object)),
-    }
-
-
-def _of_lines(lines: Sequence[Line]) -> dict[str, Any]:
-    places = padded([line.places for line in lines], 2)
-    return {
-        "line_what": ("line", np.array([WHATS.index(line.what) for line in lines], np.int8), code_flags(WHATS)),
-        "line_period": ("line", np.array([line.period for line in lines], np.int32)),
-        "line_size": ("line", np.array([len(line.places) for line in lines], np.int32)),
-        "n_tested": ("line", np.array([len(line.places) for line in lines], np.int32)),
-        "line_first": (("line", "vertex"), places[..., 0]),
-        "line_second": (("line", "vertex"), places[..., 1]),
-    }
-
-
-def _of_changes(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> dict[str, Any]:
-    row, other = (np.array([getattr(one, name) for one in changes], int) for name in ("row", "other"))
-    after = np.where(other >= 0, plane.period[other], -1) if len(row) else row
-    places = np.array([one.place for one in found]).reshape(-1, 2)
-    variables: dict[str, Any] = {
-        "change_attractor": ("change", plane.attractor[row].astype(np.int32)),
-        "change_set": ("change", plane.kind[row].astype(np.int8), code_flags(SETS)),
-        "change_period": ("change", plane.period[row].astype(np.int32)),
-        "period_after": ("change", after.astype(np.int32)),
-        "what": ("change", np.array([WHATS.index(one.what) for one in found], np.int8), code_flags(WHATS)),
-        "on_curve": ("change", np.array([one.curve for one in found], np.int32)),
-        "on_line": ("change", np.array([one.line for one in found], np.int32)),
-        "change_cells": ("change", plane.cells[row].astype(np.int32)),
-        "why": ("change", np.array([one.why for one in found], object)),
-        "change_error": ("change", np.array([one.error for one in found], float)),
-    }
-    for axis, which in enumerate(("first", "second")):
-        variables[f"change_{which}"] = ("change", places[:, axis])
-        for role in ("here", "there"):
-            nodes = np.array([getattr(one, role) for one in changes], int)
-            variables[f"{role}_{which}"] = ("change", plane.values[nodes, axis])
-    return variables

@@ -88,7 +88,8 @@ def verdicts(
 def met_at(points: Sequence[Array], rows: Sequence[int], state: Array, system: System) -> int:
     """Return the row, of some at one point of the plane, of the orbit through a state; -1 if it is none of them."""
     return next(
-        (row for row in rows if len(points[row]) and scaled_distance(points[row], state, system).min() < SAME_AT_POINT), -1
+        (row for row in rows if len(points[row]) and scaled_distance(points[row], state, system).min() < SAME_AT_POINT),
+        -1,
     )
 
 

@@ -56,8 +56,9 @@ def named(plane: Plane, row: int, axis: int, target: float, base: Parameters) ->
     inside = along[max(ends[0] - BESIDE, 0) : ends[1] + BESIDE + 1]
     places = np.flatnonzero(np.isin(plane.sets[name].values, inside))
     line = int(np.flatnonzero(plane.sets[other].values == here[1 - axis])[0])
+    between = float(along[ends[0]]), float(along[ends[1]])
     part = isel(plane.sets, {name: places, other: line})
-    found = events_within(part, parameter_name(name), base, float(plane.size[axis]))
+    found = events_within(part, parameter_name(name), base, (float(along[0]), float(along[-1])), between=between)
     number, rises = int(plane.attractor[row]), int(target > here[axis])
     seen = found["seen"].values == here[axis]
     own = np.flatnonzero(seen & (found["attractor"].values == number) & (found["rises"].values == rises))

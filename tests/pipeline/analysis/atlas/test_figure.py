@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.colors import to_hex
 from shapely.geometry import shape
 
-from pipeline.analysis.atlas.analysis import WHATS
+from pipeline.analysis.atlas.dataset import WHATS
 from pipeline.analysis.atlas.figure import plot_atlas
 from pipeline.analysis.atlas.shapes import pieces_of
 from pipeline.analysis.branches.kinds import CURVE_KINDS
