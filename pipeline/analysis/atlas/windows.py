@@ -17,7 +17,7 @@ from pipeline.layout.vocabulary import APERIODIC, parameter_name
 from pipeline.results.ragged import isel
 from pipeline.results.tabular import words_of
 
-BESIDE = 2
+BESIDE = 1
 """Points of a window beyond the two between which a set ends, on each side."""
 
 NO_WINDOW = "a set that is no orbit; it was named at no place of its line (--windows)"
