@@ -181,7 +181,7 @@ ATLAS_COLUMNS: Columns = (
 
 ATLAS = Analysis(
     "atlas",
-    """Chart a plane of two parameters: curves and lines, the regions between them, and every change that none explains.
+    """Chart a plane of two parameters: its curves, the regions between them, and each change that none explains.
 
     Each attractor that a neighbouring parameter point lacks is followed to its end. Bifurcations are continued as
     curves, the plane is cut into regions, and each change is listed with what explains it, or as not explained. Curves
@@ -203,7 +203,7 @@ class AtlasFigureOptions(AtlasOptions, FigureOptions):
 
 ATLAS_FIGURE = Figure(
     "atlas",
-    "Draw the atlas of a plane: regions by their attractors, curves by kind, and the changes that are not explained.",
+    "Draw the atlas of a plane: regions by their attractors, curves by kind, changes that are not explained.",
     AtlasFigureOptions,
     "pipeline.analysis.atlas.figure:draw_atlas",
 )
