@@ -10,12 +10,12 @@ import numpy as np
 from magpend_core.equilibria import is_held
 from magpend_core.models.model import Parameters
 from pipeline.analysis.atlas.plane import Plane
-from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
+from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.bifurcations import Bifurcation, n_unstable
 from pipeline.analysis.branches.exploring import first_of
 from pipeline.analysis.branches.following import Branch, half_branch, half_orbit, opposite, problem_of
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, LIMITS
-from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.known import Start, at_value
 from pipeline.analysis.branches.limits import settle_limits
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import judge
@@ -89,10 +89,36 @@ def _towards(start: Start, target: float) -> Steps[Branch | None]:
     if found is None:
         return None
     family, point = found
+    if n_unstable(point) == 0 and (there := (yield from _at_once(family, point, target))) is not None:
+        return Branch(family, [point, there], [], ("start", "bound"))
     # the starting orbit lies on no bound: its value is known up to rounding
     low, high = sorted((2.0 * start.value - target, target))
     half = yield from half_branch(family, point if target > start.value else opposite(point), low, high, TRACE)
     return Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end))
+
+
+def _at_once(family: Family, point: Point, target: float) -> Steps[Point | None]:
+    """Return the stable orbit at a value of the parameter to which one step along the tangent leads; None if the
+    tangents of both orbits do not lead to each other.
+    """
+    near = 0.1  # largest error of a step along a tangent, in units of the step
+    move = target / family.scales[0] - point.u[-1]
+    there, step = None, _step(point, move)
+    if step is not None:
+        there = yield from at_value(family, point.u + step)
+    back = None if there is None or n_unstable(there) else _step(there, -move)
+    if there is None or step is None or back is None:
+        return None
+    errors = np.linalg.norm(there.u - point.u - step), np.linalg.norm(point.u - there.u - back)
+    return there if max(errors) <= near * np.linalg.norm(step) else None
+
+
+def _step(point: Point, move: float) -> np.ndarray | None:
+    """Return the step along the tangent that moves the parameter by so much; None where the tangent is too steep."""
+    longest = 0.3  # scaled
+    if abs(point.tangent[-1]) < abs(move) / longest:
+        return None
+    return np.asarray(point.tangent * (move / point.tangent[-1]))
 
 
 def _lost(branch: Branch) -> list[Bifurcation]:
