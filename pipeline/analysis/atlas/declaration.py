@@ -132,7 +132,7 @@ ATLAS_COLUMNS: Columns = (
         "curve",
         n_crossed="pairs of neighbouring points between which its stable part passes",
         n_effects="of these, pairs whose attractors it changes",
-        effect="why it changes no attractor, if it changes none",
+        effect="why no change is seen at the other pairs, or anywhere",
     ),
     *over("curve point", others_unstable="unstable multipliers beside the critical ones"),
     *over("line", line_what="what lies on the line", line_period="period of the orbit, 0 none"),

@@ -17,7 +17,7 @@ from pipeline.analysis.events.kinds import LIVES_ON
 from pipeline.results.tabular import counted
 
 FOLLOWED_BACK = 8
-"""Places of a curve without an effect at which the orbits beside it are followed to the neighbouring points."""
+"""Most places of a curve without a change from which the orbits beside it are followed to the neighbouring points."""
 
 UNSTABLE = "its orbits are unstable on both sides"
 NOT_CROSSED = "its stable part passes between no two neighbouring points"
@@ -89,7 +89,7 @@ def effects_of(
     tracks: Sequence[Array],
     stable: Sequence[Array],
 ) -> list[Effect]:
-    """Return the effect of each curve, and why it has none.
+    """Return the effect of each curve, and why it has none at some or all crossings.
 
     Parameters
     ----------
@@ -106,16 +106,18 @@ def effects_of(
         own = [k for k, one in enumerate(crossed.curve) if one == number]
         edges = {crossed.edge[k] for k in own}
         changed = {int(plane.parent[c.edge]) for c, v in zip(changes, found, strict=True) if v.curve == number}
+        silent = [k for k in own if crossed.edge[k] not in changed]
         why = ""
-        if not changed:
-            why = UNSTABLE if not stable[number].any() else NOT_CROSSED
-            why = _silence(plane, curve, crossed, own) if own else why
+        if silent:
+            why = _silence(plane, curve, crossed, silent)
+        elif not changed:
+            why = NOT_CROSSED if stable[number].any() else UNSTABLE
         effects.append(Effect(len(edges | changed), len(changed), why))
     return effects
 
 
 def _silence(plane: Plane, curve: Curve, crossed: Crossings, own: Sequence[int]) -> str:
-    """Follow the stable orbits beside a curve to the neighbouring points, and say why no change was seen there."""
+    """Follow the stable orbits at some crossings to the neighbouring points, and say why no change was seen there."""
     if curve.kind in (HOMOCLINIC, *BRANCH_POINTS):
         return "not followed from this kind of point"
     chosen = [own[int(k)] for k in np.unique(np.linspace(0, len(own) - 1, FOLLOWED_BACK).round())]

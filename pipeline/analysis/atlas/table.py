@@ -114,7 +114,7 @@ def _curve_lines(ds: xr.Dataset) -> list[str]:
                 "": LABELS[kind],
                 "kind": f"{NAMES[kind]}, {f'period {period}' if period else 'equilibria'}",
                 "pairs with a change": f"{effects} of {crossed}",
-                "if none, why": str(ds["effect"].values[k]),
+                "elsewhere": str(ds["effect"].values[k]),
             }
         )
     return aligned(lines)
