@@ -11,12 +11,12 @@ import xarray as xr
 from pipeline.analysis.atlas.charting import Chart, Located, charted, others_unstable
 from pipeline.analysis.atlas.dataset import ends_dataset, of_changes, of_curves, of_lines
 from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions, SetEndOptions
-from pipeline.analysis.atlas.effects import effects_of
+from pipeline.analysis.atlas.effects import Crossings, crossings, effects_of
 from pipeline.analysis.atlas.ends import End, at_node, follow_all, start_of
 from pipeline.analysis.atlas.further import Wanted, wanted, with_further
 from pipeline.analysis.atlas.further import dataset_of as further_dataset
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
-from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, plane_of
+from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, pairs_on, plane_of
 from pipeline.analysis.atlas.regions import variables_of_regions
 from pipeline.analysis.atlas.verdicts import Verdict, verdicts
 from pipeline.analysis.atlas.windows import carried, chosen, named, set_lines
@@ -102,6 +102,11 @@ def _ways(plane: Plane, changes: Sequence[Change]) -> list[tuple[int, int, float
 def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[float]]) -> xr.Dataset:
     """Follow orbits that a neighbouring point lacks towards that point."""
     plane = _plane(run, options)
+    return ends_dataset(plane, wanted, _followed(run, plane, wanted), run.model.state_names)
+
+
+def _followed(run: OpenRun, plane: Plane, wanted: Sequence[Sequence[float]]) -> list[End]:
+    """Follow orbits from their points: the row of each, the parameter along which, and up to which value."""
     base, starts = parameters_of(run.cube()), []
     ends = [End(UNDECIDED, why="Newton's method found no orbit there")] * len(wanted)
     for k, (row, axis, target) in enumerate(wanted):
@@ -111,7 +116,7 @@ def orbit_ends(run: OpenRun, options: PlaneOptions, wanted: Sequence[Sequence[fl
     followed = follow_all([(start, target) for _, start, target in starts])
     for (k, _, _), end in zip(starts, followed, strict=True):
         ends[k] = end
-    return ends_dataset(plane, wanted, ends, run.model.state_names)
+    return ends
 
 
 def windows(run: OpenRun, options: SetEndOptions) -> list[list[float]]:
@@ -149,11 +154,13 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     run.echo(f"atlas: {len(changes)} changes between {len(plane.edges)} pairs of neighbouring points")
     found = _verdicts(run, options, plane, changes)
     chart = _charted(run, options, plane, changes, found)
-    lines = _lines(plane, changes, found)
-    curves = curves_dataset(chart.curves, *plane.names, run.model)
     tracks = [plane.scaled(np.array([c.family.values(p.u) for p in c.points])) for c in chart.curves]
     others = [others_unstable(curve) for curve in chart.curves]
-    told = effects_of(plane, changes, found, chart.curves, tracks, [one == 0 for one in others])
+    crossed = crossings(plane, tracks, [one == 0 for one in others])
+    _look_again(run, plane, changes, found, chart, crossed)
+    lines = _lines(plane, changes, found)
+    curves = curves_dataset(chart.curves, *plane.names, run.model)
+    told = effects_of(plane, changes, found, chart.curves, crossed, [one == 0 for one in others])
     variables = {**of_curves(curves, others, told), **of_lines(lines), **of_changes(plane, changes, found)}
     same = [(change.row, one.row) for change, one in zip(changes, found, strict=True) if one.row >= 0]
     pairs = np.array(same, int).reshape(-1, 2)
@@ -183,17 +190,12 @@ def _family(run: OpenRun, plane: Plane, period: int) -> Family:
     return Family(run.model.system, period, frequency, packed, plane.names, scales)
 
 
-def _charted(
-    run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]
-) -> Chart:
-    """Continue the located bifurcations, and give each change the curve on which it lies."""
-    own = [
-        k
-        for k, one in enumerate(found)
-        if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None and one.period <= options.curve_period
-    ]
+def _located(
+    run: OpenRun, plane: Plane, changes: Sequence[Change], found: Sequence[Verdict], own: Sequence[int]
+) -> list[Located]:
+    """Return the bifurcations that explain some changes."""
     families = {period: _family(run, plane, period) for period in {0, *(found[k].period for k in own)}}
-    located = [
+    return [
         Located(
             families[0 if one.what in (HOMOCLINIC, SNIC) else one.period],
             one.what,
@@ -204,6 +206,18 @@ def _charted(
         )
         for one, change in ((found[k], changes[k]) for k in own)
     ]
+
+
+def _charted(
+    run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]
+) -> Chart:
+    """Continue the located bifurcations, and give each change the curve on which it lies."""
+    own = [
+        k
+        for k, one in enumerate(found)
+        if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None and one.period <= options.curve_period
+    ]
+    located = _located(run, plane, changes, found, own)
     margin = MARGIN * plane.size
     low, high = plane.low - margin, plane.low + plane.size + margin
     for axis, name in enumerate(plane.names):
@@ -219,6 +233,31 @@ def _charted(
         if one.curve < 0 and one.state is None and (other := on_edge.get((change.edge, one.what))) is not None:
             one.curve, one.place, one.error = other.curve, other.place, other.error
     return chart
+
+
+def _look_again(
+    run: OpenRun, plane: Plane, changes: list[Change], found: list[Verdict], chart: Chart, crossed: Crossings
+) -> None:
+    """Add changes that move too little to be seen as jumps, as near a cusp: where the stable part of a curve passes
+    between two points without a change, their orbits are followed as well; in place.
+    """
+    known = {(change.edge, one.curve) for change, one in zip(changes, found, strict=True)}
+    ways = {(change.edge, change.row) for change in changes}
+    asked = [
+        change
+        for curve, edge in sorted(set(zip(crossed.curve, crossed.edge, strict=True)) - {(c, e) for e, c in known})
+        for change in pairs_on(plane, edge, chart.curves[curve].family.period)
+        if (edge, change.row) not in ways and not plane.is_parted[edge]
+    ]
+    asked = list(dict.fromkeys(asked))
+    wanted = [list(way) for way in _ways(plane, asked)]
+    ends = ends_dataset(plane, wanted, _followed(run, plane, wanted), run.model.state_names)
+    more = verdicts(plane, asked, range(len(asked)), ends, run.model.system)
+    seen = [k for k, one in enumerate(more) if one.what in KINDS]
+    for k, one in zip(seen, _located(run, plane, asked, more, seen), strict=True):
+        more[k].curve = chart.holding(one)
+        changes.append(asked[k])
+        found.append(more[k])
 
 
 def _agree(changes: Sequence[Change], found: Sequence[Verdict]) -> None:

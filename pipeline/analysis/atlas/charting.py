@@ -103,6 +103,11 @@ class Chart:
                 if self.located[i].key == key and track.holds(self.located[i]):
                     self.curve_of[i] = number
 
+    def holding(self, one: Located) -> int:
+        """Return the curve on which a bifurcation lies, -1 none."""
+        own = (k for k, c in enumerate(self.curves) if (c.kind, c.family.period) == one.key and _Track.of(c).holds(one))
+        return next(own, -1)
+
     def grow(self, bounds: Bounds, longest: int, generations: int) -> None:
         """Start a curve of each kind and period at a time, until all bifurcations lie on curves or no start helps."""
         tried: dict[tuple[Any, ...], int] = {}

@@ -39,7 +39,10 @@ def ends_dataset(
         "end_first": ("end", places[:, 0]),
         "end_second": ("end", places[:, 1]),
         "end_error": ("end", [e.error / plane.size[int(w[1])] for w, e in zip(wanted, ends, strict=True)]),
-        "end_section": (("end", "state"), np.array([empty if e.state is None else e.state for e in ends])),
+        "end_section": (
+            ("end", "state"),
+            np.array([empty if e.state is None else e.state for e in ends]).reshape(-1, n),
+        ),
         "why": ("end", np.array([end.why for end in ends], object)),
     }
     attrs = {"first_parameter": plane.names[0], "second_parameter": plane.names[1]}

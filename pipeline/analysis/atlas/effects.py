@@ -86,7 +86,7 @@ def effects_of(
     changes: Sequence[Change],
     found: Sequence[Verdict],
     curves: Sequence[Curve],
-    tracks: Sequence[Array],
+    crossed: Crossings,
     stable: Sequence[Array],
 ) -> list[Effect]:
     """Return the effect of each curve, and why it has none at some or all crossings.
@@ -97,10 +97,9 @@ def effects_of(
         The plane, its changes and the verdicts on them.
     curves
         The curves.
-    tracks, stable
-        See `crossings`.
+    crossed, stable
+        Crossings of their stable parts with edges, see `crossings`.
     """
-    crossed = crossings(plane, tracks, stable)
     effects = []
     for number, curve in enumerate(curves):
         own = [k for k, one in enumerate(crossed.curve) if one == number]

@@ -11,7 +11,7 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import wrap_angles
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import dims_of, point_of_rows, points_of_rows
 from pipeline.results.selection import choose, start_dims
@@ -140,6 +140,17 @@ def changes_of(plane: Plane, system: System) -> list[Change]:
             elif plane.kind[rows[0]] not in APERIODIC:
                 pairs.append(Change(edge, a, b, *rows))
     return sorted([*found, *_jumps(plane, pairs, system)])
+
+
+def pairs_on(plane: Plane, edge: int, period: int) -> list[Change]:
+    """Return the orbits of a period (0: equilibria) with one id at both points of an edge, as changes both ways."""
+    own = (plane.kind == (PERIODIC_ORBIT if period else EQUILIBRIUM)) & (plane.period == period)
+    a, b = plane.edges[edge].tolist()
+    here, there = (
+        {int(plane.attractor[row]): int(row) for row in np.flatnonzero(own & (plane.node == node))} for node in (a, b)
+    )
+    both = sorted(here.keys() & there.keys())
+    return [one for number in both for one in _both_ways(edge, a, b, (here[number], there[number]))]
 
 
 def _both_ways(edge: int, a: int, b: int, rows: tuple[int, int]) -> list[Change]:
