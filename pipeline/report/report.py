@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.analysis.atlas.sentences import sentences
 from pipeline.analysis.events.kinds import RANGE_END
 from pipeline.analysis.spectrum.declaration import SpectrumOptions
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
-from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
+from pipeline.layout.vocabulary import BRANCH, axis_name, is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.product import as_flags
 from pipeline.products.registry import ANALYSES, FIGURES
-from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
+from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, Text, grid_of, picture_of
 from pipeline.results.outcomes import sentence
 from pipeline.results.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.runs.derive import AnalysedRun, changed_options, is_current, shown_table
@@ -76,6 +77,7 @@ SHOWN = {
     "events": ("Events", "Where attractors begin, change and end"),
     "branches": ("Bifurcations", "Located bifurcations"),
     "curves": ("Curves of bifurcations", "Points of codimension two on the curves of bifurcations"),
+    "atlas": ("Atlas", ""),
     "orbits": ("Periodic orbits", "All periodic orbits found at a parameter point, stable or not"),
     "manifolds": ("Stable and unstable manifolds", "Manifolds of the saddle orbits"),
     "tangency": ("Homoclinic tangencies", "Parameter values at which manifolds of a saddle orbit first touch"),
@@ -291,7 +293,7 @@ def _analyses(shown: Shown) -> Iterator[Part]:
         known = shown.options_of(name)
         blocks: list[Block] = [] if known else [_missing(shown, name)]
         for options in known:
-            blocks += _analysis(shown, name, options)
+            blocks += _atlas(shown, options) if name == "atlas" else _analysis(shown, name, options)
         yield Part(heading, blocks)
 
 
@@ -304,6 +306,8 @@ def _suits(shown: Shown, name: str) -> bool:
         return sum(map(is_grid_dim, shown.starts)) >= 2
     known = name in shown.computed or bool(stored_options(shown.run, name))
     if name == "events" and len(_long_axes(shown)) == 1:
+        return True
+    if name == "atlas" and len(_long_axes(shown)) == 2 and BRANCH not in shown.starts:
         return True
     return known or name in ("branches", "chaos") or (name == "spectrum" and bool(shown.computed))
 
@@ -359,6 +363,19 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
         where = " at the first values of the axes" if any(shown.cube.sizes[d] > 1 for d in at) else ""
         own = {key: value for key, value in options.items() if key in FIGURES[drawn].options.model_fields}
         yield from _drawn(shown, drawn, f"{SHOWN[name][1]}{where}", **own, **({"at": at} if at else {}))
+
+
+def _atlas(shown: Shown, options: Mapping[str, Any]) -> Iterator[Block]:
+    """Make the figure of an atlas, and say in sentences what the plane contains."""
+    try:
+        found = in_own_words(shown.run.derive("atlas", **options))
+    except SpecError as error:
+        yield Note(str(error))
+        return
+    options = settled_options("atlas", found.attrs)
+    yield from _drawn(shown, "atlas", "Regions of the plane by their attractors", **options)
+    yield from map(Text, sentences(found))
+    yield Note("Each change of attractors, and each curve:", command_of("analyse atlas", options, shown.directory))
 
 
 _OF_ATTRACTORS = {

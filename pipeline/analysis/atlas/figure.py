@@ -14,8 +14,9 @@ from matplotlib.path import Path
 
 from pipeline.analysis.atlas.declaration import AtlasFigureOptions, AtlasOptions
 from pipeline.analysis.atlas.plane import Array
+from pipeline.analysis.atlas.sentences import LEAST_AREA
 from pipeline.analysis.atlas.shapes import Piece, bounds_of, line_places, pieces_of, rings_of
-from pipeline.analysis.atlas.table import audit_of
+from pipeline.analysis.atlas.table import audit_of, kind_text
 from pipeline.analysis.branches.figure import curve_look, mark_points
 from pipeline.analysis.branches.kinds import CURVE_KINDS, LABELS, NAMES
 from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, UNDECIDED
@@ -23,13 +24,10 @@ from pipeline.layout.conventions import shown_unit
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.results.run import OpenRun
-from pipeline.results.tabular import counted, plain, words_of
+from pipeline.results.tabular import counted, words_of
 
 REGION_TINT = 0.55
 """Share of white in the tints of regions: any two of the twelve differ by 6 or more, measured as in `palette`."""
-
-LEAST_AREA = 0.002
-"""Share of the plane below which regions with the same attractors have no colour of their own."""
 
 _PALE = 0.5
 """Share of white in the colours of curves whose orbits are unstable on both sides."""
@@ -83,7 +81,7 @@ def plot_atlas(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Data
         `data` are the atlas.
     """
     pieces, marks = list(pieces_of(ds)), list(_marks(ds))
-    tints = _tints(ds)
+    tints = region_tints(ds)
     entries = [*_region_entries(ds, tints), *_curve_entries(ds, pieces), *_line_entries(ds), *_mark_entries(marks)]
     data = style.storable(ds, "atlas").assign(region_label=ds["region_label"].astype(str))
     fig, ax = palette.new_panel(data, entries, frame, 4.6, handle=2.2)
@@ -110,7 +108,7 @@ def plot_atlas(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Data
 # ---- regions -----------------------------------------------------------------------------------
 
 
-def _tints(ds: xr.Dataset) -> dict[str, Any]:
+def region_tints(ds: xr.Dataset) -> dict[str, Any]:
     """Return the tint of each label of a region: the labels with the largest areas have the colours of the style."""
     total = _areas(ds)
     own = [name for name, area in total.items() if name not in _GREYS and area >= LEAST_AREA]
@@ -213,9 +211,9 @@ def _marker_of(kind: str) -> str:
 
 def _line_entries(ds: xr.Dataset) -> list[palette.Entry]:
     kinds = sorted({*_kinds_of_lines(ds)} - {UNDECIDED})
-    texts = {kind: EVENTS[kind].text if kind in EVENTS else plain(kind) for kind in kinds}
     return [
-        Line2D([], [], marker=_marker_of(kind), label=f"{texts[kind]}, on no curve", **_LINE, **_MARK) for kind in kinds
+        Line2D([], [], marker=_marker_of(kind), label=f"{kind_text(kind)}, on no curve", **_LINE, **_MARK)
+        for kind in kinds
     ]
 
 

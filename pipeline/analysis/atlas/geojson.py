@@ -10,9 +10,8 @@ import numpy as np
 
 from pipeline.analysis.atlas.plane import Array
 from pipeline.analysis.atlas.shapes import line_places, pieces_of, rings_of
-from pipeline.analysis.atlas.table import audit_of
+from pipeline.analysis.atlas.table import audit_of, open_changes
 from pipeline.analysis.branches.kinds import CURVE_KINDS
-from pipeline.analysis.events.kinds import UNDECIDED
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import in_own_words
 from pipeline.layout.vocabulary import parameter_name
@@ -109,7 +108,7 @@ def _lines(ds: xr.Dataset) -> Iterator[dict[str, Any]]:
 
 def _not_explained(ds: xr.Dataset) -> Iterator[dict[str, Any]]:
     sets = words_of(ds["change_set"])
-    for k in np.flatnonzero(ds["what"].values == words_of(ds["what"]).index(UNDECIDED)).tolist():
+    for k in open_changes(ds):
         one = ds.isel(change=k)
         yield _feature(
             "not explained",

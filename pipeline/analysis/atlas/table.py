@@ -1,4 +1,4 @@
-"""Tell what an atlas contains: its regions, the audit of its changes, and its curves."""
+"""List what an atlas contains: its regions, the audit of its changes, and its curves."""
 
 from __future__ import annotations
 
@@ -31,6 +31,32 @@ def audit_of(ds: xr.Dataset) -> dict[str, int]:
         "not_found": int(unseen.sum()),
         "not_explained": int(open_.sum()),
     }
+
+
+def open_changes(ds: xr.Dataset) -> list[int]:
+    """Return the numbers of the changes of an atlas that are not explained."""
+    return np.flatnonzero(ds["what"].values == words_of(ds["what"]).index(UNDECIDED)).tolist()
+
+
+def told_change(ds: xr.Dataset, change: int) -> str:
+    """Return the attractor of a change and its place, as a text."""
+    names = [(str(ds.attrs[f"{which}_parameter"]), f"change_{which}") for which in ("first", "second")]
+    at = ", ".join(f"{name} {float(ds[place][change]):.6g}" for name, place in names)
+    kind = plain(words_of(ds["change_set"])[int(ds["change_set"][change])])
+    period = f" of period {int(ds['change_period'][change])}" if ds["change_period"][change] else ""
+    return f"{letter(int(ds['change_attractor'][change]))}, {kind}{period}, at {at}"
+
+
+def listed_kinds(ds: xr.Dataset) -> str:
+    """Return the kinds of what explains the changes of an atlas, with the number of changes of each."""
+    what = [words_of(ds["what"])[code] for code in ds["what"].values.tolist()]
+    kinds = Counter(one for one in what if one not in (UNDECIDED, LIVES_ON, GOES_ON))
+    return ", ".join(f"{n} {kind_text(kind)}" for kind, n in kinds.most_common())
+
+
+def kind_text(kind: str) -> str:
+    """Return what explains a change, as a text."""
+    return EVENTS[kind].text if kind in EVENTS else plain(kind)
 
 
 def atlas_table(ds: xr.Dataset) -> Table:
@@ -82,24 +108,15 @@ def _region_lines(ds: xr.Dataset) -> list[str]:
 
 def _audit_lines(ds: xr.Dataset) -> list[str]:
     n = audit_of(ds)
-    what = [words_of(ds["what"])[code] for code in ds["what"].values.tolist()]
-    kinds = Counter(one for one in what if one not in (UNDECIDED, LIVES_ON, GOES_ON))
-    listed = ", ".join(f"{k} {EVENTS[name].text if name in EVENTS else plain(name)}" for name, k in kinds.most_common())
+    listed = listed_kinds(ds)
     lines = [
         f"{counted(n['seen'], 'change')} of attractors between neighbouring points",
         f"  explained: {n['on_curves']} on curves, {n['on_lines']} on lines{f' ({listed})' if listed else ''}",
         f"  not found by cells: {n['not_found']} (the orbit is stable at both points)",
         f"  not explained: {n['not_explained']}",
     ]
-    names = [str(ds.attrs[f"{which}_parameter"]) for which in ("first", "second")]
-    left = [k for k, one in enumerate(what) if one == UNDECIDED]
-    for k in left[:MOST]:
-        at = ", ".join(
-            f"{m} {float(ds[f'change_{w}'][k]):.6g}" for m, w in zip(names, ("first", "second"), strict=True)
-        )
-        set_ = plain(words_of(ds["change_set"])[int(ds["change_set"][k])])
-        period = f" of period {int(ds['change_period'][k])}" if ds["change_period"][k] else ""
-        lines.append(f"    {letter(int(ds['change_attractor'][k]))}, {set_}{period}, at {at}: {ds['why'].values[k]}")
+    left = open_changes(ds)
+    lines += [f"    {told_change(ds, k)}: {ds['why'].values[k]}" for k in left[:MOST]]
     return lines + ([f"    and {len(left) - MOST} more"] if len(left) > MOST else [])
 
 
