@@ -93,12 +93,8 @@ def _cells(run: ExploredRun, one: xr.Dataset, x: str, place: Mapping[str, int]) 
     if not bool(here.any()):
         return None, None
     start = dict(zip(map(str, here.dims), np.argwhere(here.values)[0].tolist(), strict=True))
-
-    def number(index: int) -> int:
-        cell = {**start, **place, x: index}
-        return int(np.ravel_multi_index([cell[d] for d in run.plan.dims], run.plan.shape))
-
-    return number(seen), None if beyond is None else number(beyond)
+    before, after = (None if i is None else run.number({**start, **place, x: i}) for i in (seen, beyond))
+    return before, after
 
 
 def _index(values: np.ndarray, value: float) -> int | None:

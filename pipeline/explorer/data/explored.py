@@ -74,7 +74,14 @@ class ExploredRun(RunDirectory):
 
     def bifurcation_curves(self) -> xr.Dataset | None:
         """Return the stored bifurcation curves of this run, or of the run named for them; None if there are none."""
-        return self.kept("curves") if self.curves is None else ExploredRun.open(self.curves).kept("curves")
+        if self.curves is not None:
+            return ExploredRun.open(self.curves).bifurcation_curves()
+        found = self.atlas()
+        return self.kept("curves") if found is None else found
+
+    def atlas(self) -> xr.Dataset | None:
+        """Return the stored atlas; None if there is none, or if another run is named for the curves."""
+        return self.kept("atlas") if self.curves is None else None
 
     def refreshed(self) -> ExploredRun:
         """Return the run as it is now, with the cells and results that were added since it was opened."""
@@ -191,6 +198,10 @@ class ExploredRun(RunDirectory):
             raise RequestError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
         index = np.unravel_index(number, self.plan.shape)
         return {dim: int(i) for dim, i in zip(self.plan.dims, index, strict=True)}
+
+    def number(self, index: Mapping[str, int]) -> int:
+        """Return the flat number of the cell at an index on each dim."""
+        return int(np.ravel_multi_index([index[d] for d in self.plan.dims], self.plan.shape))
 
     def inputs(self, index: Mapping[str, int]) -> Inputs:
         """Return the inputs of a cell's integration: packed parameters, frequency and initial state."""

@@ -26,7 +26,7 @@ from pipeline.explorer.data.view import can_have
 from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, KINDS, PERIODIC_ORBIT, letter, model_of
 from pipeline.plots import palette
 from pipeline.plots.labels import state_measure
-from pipeline.results.outcomes import share_interval
+from pipeline.results.outcomes import outcomes, share_interval
 from pipeline.results.ragged import dense, isel
 from pipeline.results.tabular import sets_of
 from pipeline.store.run import RunDirectory
@@ -223,7 +223,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the attractors and other sets at a parameter point, the largest basin fraction first.
 
-    ``note`` says how to get them, where they are not known.
+    ``cell`` is the number of a cell on each; ``note`` says how to get them, where they are not known.
     """
     explored = ExploredRun.open(run)
     place = explored.place(at)
@@ -233,8 +233,17 @@ def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     cast = palette.cast_of(found)
     here = dense(isel(found, place), points=True)
     present = np.flatnonzero(here["kind"].values > 0).tolist()
-    listed = [_set(explored, here.isel(attractor=i), i, cast) for i in present]
+    ids = outcomes(isel(found, place))
+    listed = [
+        {**_set(explored, here.isel(attractor=i), i, cast), "cell": _cell_on(explored, ids, i, place)} for i in present
+    ]
     return {"attractors": sorted(listed, key=lambda a: -(a["share"] or 0.0)), "note": None}
+
+
+def _cell_on(run: ExploredRun, ids: xr.DataArray, number: int, place: Mapping[str, int]) -> int | None:
+    """Return the number of the first cell on a set at a parameter point; None if no cell is on it."""
+    own = np.argwhere((ids == number).values)
+    return run.number({**place, **dict(zip(map(str, ids.dims), own[0].tolist(), strict=True))}) if len(own) else None
 
 
 def _set(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> dict[str, Any]:

@@ -14,38 +14,51 @@ from magpend_core.orbits import section_map
 from pipeline.analysis.branches.kinds import CURVE_KINDS, HOMOCLINIC, LABELS, NAMES
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
+from pipeline.explorer.data.atlas import atlas
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import ORBIT_RTOL, fixed_points, orbit_series, parts_of
+from pipeline.explorer.data.verticals import plain
 from pipeline.layout.conventions import shown_unit
-from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
+from pipeline.layout.own_words import in_own_words
+from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, axis_name, frequency_of, split_dims
 from pipeline.plots.labels import swept_label
 from pipeline.results.ragged import ROW_SIZE, point_of_rows
+from pipeline.runs.derive import options_of
 from pipeline.store.run import RunDirectory
 
 NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or name their run with --curves"
 
 
 def parameter_plane(run: RunDirectory) -> dict[str, Any]:
-    """Return the bifurcation curves of a run, and over their plane the number of attractors if the run sweeps it.
+    """Return the bifurcation curves of a run, over its atlas or, if it sweeps their plane, the number of attractors.
 
     ``axes`` are across and upwards, ``points`` those of codimension two; ``map`` has values of both axes, the number of
-    attractors at each point, and colours; ``note`` says why there are no curves.
+    attractors at each point, and colours; ``note`` says why there are no curves. See `pipeline.explorer.data.atlas`.
     """
     explored = ExploredRun.open(run)
     found = explored.bifurcation_curves()
     if found is None:
-        return {"axes": [], "curves": [], "points": [], "map": None, "note": NOTHING}
+        return {"axes": [], "curves": [], "points": [], "map": None, "atlas": None, "note": NOTHING}
+    regions = atlas(explored)
+    number = None if regions else _number_of_attractors(explored, found)
+    found = in_own_words(found)
     names = [str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")]
     return {
         "axes": [
-            {"name": name, "label": swept_label(name, shown_unit(found[role].attrs))}
+            {"name": name, "label": _label(name, shown_unit(found[role].attrs))}
             for name, role in zip(names, ("first", "second"), strict=True)
         ],
         "curves": [_curve(found, i) for i in range(found.sizes["curve"])],
         "points": [_special(found, k) for k in range(found.sizes["special"])],
-        "map": _map(explored, names),
+        "map": None if number is None else _map(number, names),
+        "atlas": regions,
         "note": None,
     }
+
+
+def _label(name: str, unit: str) -> str:
+    label = swept_label(name, unit)
+    return plain(label.replace("$", ""), name) if "$" in label else label
 
 
 def _curve(found: xr.Dataset, i: int) -> dict[str, Any]:
@@ -56,6 +69,7 @@ def _curve(found: xr.Dataset, i: int) -> dict[str, Any]:
         "period": period,
         "x": found["first"].values[i, :n].tolist(),
         "y": found["second"].values[i, :n].tolist(),
+        "pale": found["others_unstable"].values[i, :n].astype(bool).tolist() if "others_unstable" in found else None,
     }
 
 
@@ -71,18 +85,22 @@ def _special(found: xr.Dataset, k: int) -> dict[str, Any]:
     }
 
 
-def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
-    """Return the number of attractors over the plane of two parameters; None unless the run sweeps just these."""
+def _number_of_attractors(run: ExploredRun, found: xr.Dataset) -> xr.DataArray | None:
+    """Return the number of attractors over the plane of curves; None unless the run sweeps just its two parameters."""
     attractors = run.kept("attractors")
     if attractors is None:
         return None
     swept = [d for d in map(str, split_dims(attractors["attractor_id"])[0]) if attractors.sizes[d] > 1]
-    if sorted(swept) != sorted(names):
+    if sorted(swept) != sorted(str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")):
         return None
     own = point_of_rows(attractors)[attractors["stability"].values == ATTRACTS]
     sets = attractors[ROW_SIZE]
-    count = sets.copy(data=np.bincount(own, minlength=sets.size).reshape(sets.shape))
-    number = count.squeeze().transpose(names[1], names[0]).sortby(names)
+    count = sets.copy(data=np.bincount(own, minlength=sets.size).reshape(sets.shape)).squeeze()
+    return in_own_words(count.to_dataset(name="number").assign_attrs(attractors.attrs))["number"]
+
+
+def _map(number: xr.DataArray, names: list[str]) -> dict[str, Any]:
+    number = number.transpose(names[1], names[0]).sortby(names)
     most = int(number.max())
     shades = colormaps["cividis"](np.linspace(0.25, 1.0, max(most, 1)))
     colours = [to_hex("0.8"), *map(to_hex, shades)]
@@ -131,7 +149,8 @@ def packed_orbit(
 
 
 def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float]:
-    values = {str(one.attrs[f"{role}_parameter"]): float(one[role]) for role in ("first", "second")}
+    values = {axis_name(name): float(value) for name, value in options_of(one.attrs).get("at", {}).items()}
+    values |= {str(one.attrs[f"{role}_parameter"]): float(one[role]) for role in ("first", "second")}
     base = {FREQUENCY_DIM: run.spec.frequency_hz} if run.spec.frequency_hz is not None else {}
     clock = frequency_of(run.model, base | values)
     own = {name: value for name, value in values.items() if name != FREQUENCY_DIM}

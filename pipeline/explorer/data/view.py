@@ -202,6 +202,7 @@ def _has(run: ExploredRun) -> dict[str, bool]:
         "attractors": run.kept("attractors") is not None,
         "branches": run.kept("branches") is not None,
         "curves": run.bifurcation_curves() is not None,
+        "atlas": run.atlas() is not None,
         "events": bool(run.kept_each("events")),
         "basins": run.kept("basins") is not None,
         "lyapunov": any(str(n).startswith("lyapunov") for n in run.cube().data_vars) or run.kept("chaos") is not None,
@@ -212,7 +213,7 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
     """Return the command for each analysis that is not yet stored and that the run allows."""
-    wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
+    wanted = [name for name in ("attractors", "branches", "basins", "atlas") if run.kept(name) is None]
     return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if can_have(run, name)}
 
 

@@ -23,7 +23,7 @@ from pipeline.explorer.security import Guard, Rate, new_token
 from pipeline.explorer.server import Service, application, listening
 from pipeline.runs.derive import derive
 from pipeline.store.run import RunDirectory
-from tests.pipeline.explorer.small_runs import LITTLE, bent_resonance, shocked_wells
+from tests.pipeline.explorer.small_runs import LITTLE, bent_resonance, charted_plane, shocked_wells
 from tests.pipeline.factories import finished
 
 PATIENCE_S = 120.0
@@ -48,6 +48,12 @@ def wells(tmp_path_factory):
 def bent(tmp_path_factory):
     """Directories of a run along the frequency with curves, and of one over the plane."""
     return bent_resonance(tmp_path_factory.mktemp("bent-resonance"))
+
+
+@pytest.fixture(scope="session")
+def plane_with_atlas(tmp_path_factory):
+    """Directory of a run over a plane with its atlas."""
+    return charted_plane(tmp_path_factory.mktemp("plane-with-atlas"))
 
 
 class Client:

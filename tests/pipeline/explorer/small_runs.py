@@ -82,6 +82,25 @@ integration = { rtol = 1e-9, atol = 1e-9, n_transient = 100, n_keep = 12 }
 """A cycle, and a rest beside it."""
 
 
+CHARTED = """
+kind = "sweep"
+title = "Small plane of the Henon map"
+model = "henon"
+axes.a = { values = [1.0, 1.1, 1.2] }
+axes.b = { values = [0.2, 0.3] }
+initial_conditions = { kind = "random", n = 6, seed = 1, x = [-0.5, 0.5], y = [-0.2, 0.2] }
+integration = { n_transient = 1000, n_keep = 64, stop_when_closed = true, closure_tolerance = 1e-8 }
+"""
+"""A plane with chaotic sets, whose ends stay unexplained if none is named."""
+
+
+def charted_plane(folder: Path) -> Path:
+    """Compute the run of a plane with its atlas."""
+    directory = finished(folder, CHARTED)
+    derive(directory, "atlas", {"windows": 0, "curve_period": 2})
+    return directory
+
+
 def bent_resonance(folder: Path) -> tuple[Path, Path]:
     """Compute the run along the frequency with its curves, and the one over the plane with its attractors."""
     line, plane = finished(folder / "line", LINE), finished(folder / "plane", PLANE)

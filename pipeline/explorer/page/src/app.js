@@ -99,7 +99,7 @@ function build(source, host, view, messages, page) {
   curves.onLoaded = () => toolbar.showToggles();
   if (source.notice) messages.note(source.notice);
   else if (view.cells.pending) messages.note(pendingOf(view), () => host.reload());
-  const plane = new ParameterPlane(state, source, view), dark = themeSwitch();
+  const plane = new ParameterPlane(state, source, view, diagram), dark = themeSwitch();
   const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, events.element, curves.element, plane.element, messages.facts);
   const right = el("div", { class: "side-column" });
   const layout = el("div", { class: "layout" }, left, right);

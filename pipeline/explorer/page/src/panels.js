@@ -115,6 +115,7 @@ class Panels {
   async selectOnCurve() {
     const { curvePoint } = this.state.get();
     if (curvePoint) await this.showLocated(this.source.curveOrbit(curvePoint), `curve-${curvePoint.curve}-${curvePoint.point}`);
+    else if (this.grid.dataset.shown?.startsWith("curve-")) await this.select();
   }
 
   /** Show the orbit at the bifurcation of an event. */

@@ -131,3 +131,52 @@ def test_click_on_a_curve(bent: tuple[Path, Path], visit: Callable[..., Any]) ->
         page.wait_for_function("!/curve-0-0$/.test(document.querySelector('.panels').dataset.shown)")
         assert page.locator(".panels").get_attribute("data-shown").startswith("curve-")
         assert opened.complaints == []
+
+
+def test_click_in_an_atlas(plane_with_atlas: Path, visit: Callable[..., Any]) -> None:
+    """In a region its attractors and an orbit are shown, at a cross the reason and both cells; curves as ever."""
+    plane = parameter_plane(RunDirectory.open(plane_with_atlas))
+    found = plane["atlas"]
+    with served(plane_with_atlas) as address:
+        opened = drawn(visit(address))
+        page = opened.page
+        panel = page.locator(PANEL)
+        assert panel.locator("h2").text_content() == "Atlas of two parameters"
+        panel.locator(".legend li", has_text="not explained").wait_for()
+        front = panel.locator(".frame canvas").nth(1)
+        front.scroll_into_view_if_needed()
+        box = front.bounding_box()
+
+        # in the middle of the plane lies a region; the nearest point with cells is shown
+        place = {"x": 56 + 0.5 * (box["width"] - 68), "y": 8 + 0.45 * (box["height"] - 44)}
+        page.mouse.move(box["x"] + place["x"], box["y"] + place["y"])
+        told = panel.locator(".readout").text_content()
+        assert told.startswith("Region ")
+        region = int(told.split()[1].rstrip(":"))
+        front.click(position=place)
+        panel.get_by_text("the nearest point with cells").wait_for()
+        assert panel.locator(".atlas-told li").all_text_contents() == found["regions"][region]["attractors"]
+        page.locator(".panels[data-shown]").wait_for()
+        cell, point = (int(v) for v in page.locator(".panels").get_attribute("data-shown").split("-"))
+        assert point == 0
+        values = [float(v) for v in re.findall(r"= ([\d.]+)", panel.locator(".atlas-told").text_content())]
+        assert values[0] == pytest.approx(1.1)
+        assert cell // 12 == 1
+
+        # a change that is not explained: both cells
+        mark = found["marks"][0]
+        panel.get_by_label("Atlas", exact=True).select_option("mark:0")
+        assert mark["why"][1:] in panel.locator(".atlas-told").text_content()
+        for k, one in enumerate(mark["cells"]):
+            panel.locator(".atlas-told button").nth(k).click()
+            page.locator(f".panels[data-shown='{one['cell']}-0']").wait_for()
+        assert f"at.b={mark['cells'][1]['at']['b']}" in page.url or mark["cells"][1]["at"]["b"] == 0
+
+        # and from a point of a curve back to the same cell
+        front.focus()
+        page.keyboard.press("ArrowRight")
+        page.locator(".panels[data-shown^='curve-']").wait_for()
+        assert not panel.locator(".atlas-told button").count()
+        panel.get_by_label("Atlas", exact=True).select_option("mark:0")
+        page.locator(f".panels[data-shown='{mark['cells'][0]['cell']}-0']").wait_for()
+        assert opened.complaints == []
