@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.atlas.charting import Chart, Located, charted, others_unstable
-from pipeline.analysis.atlas.dataset import ends_dataset, of_changes, of_curves, of_lines
+from pipeline.analysis.atlas.dataset import ends_dataset, of_changes, of_curves, of_lines, of_searched
 from pipeline.analysis.atlas.declaration import AtlasOptions, PlaneOptions, SetEndOptions
 from pipeline.analysis.atlas.effects import Crossings, crossings, effects_of
 from pipeline.analysis.atlas.ends import End, at_node, follow_all, start_of
@@ -18,6 +18,7 @@ from pipeline.analysis.atlas.further import dataset_of as further_dataset
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
 from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, pairs_on, plane_of
 from pipeline.analysis.atlas.regions import variables_of_regions
+from pipeline.analysis.atlas.searching import Searched, followed_from, nodes_for, searched_at
 from pipeline.analysis.atlas.verdicts import Verdict, verdicts
 from pipeline.analysis.atlas.windows import carried, chosen, named, set_lines
 from pipeline.analysis.branches.curves import curves_dataset
@@ -26,6 +27,7 @@ from pipeline.analysis.branches.kinds import HOMOCLINIC, KINDS, SNIC
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.events.kinds import LIVES_ON, UNDECIDED
 from pipeline.layout.vocabulary import APERIODIC, axis_name, parameters_of
+from pipeline.products.reporting import track
 from pipeline.results.run import OpenRun
 from pipeline.specification.problems import SpecError
 
@@ -153,7 +155,8 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     changes = changes_of(plane, run.model.system)
     run.echo(f"atlas: {len(changes)} changes between {len(plane.edges)} pairs of neighbouring points")
     found = _verdicts(run, options, plane, changes)
-    chart = _charted(run, options, plane, changes, found)
+    searched = _searched(run, options, plane)
+    chart = _charted(run, options, plane, changes, found, _hidden_ends(run, plane, searched))
     tracks = [plane.scaled(np.array([c.family.values(p.u) for p in c.points])) for c in chart.curves]
     others = [others_unstable(curve) for curve in chart.curves]
     crossed = crossings(plane, tracks, [one == 0 for one in others])
@@ -162,10 +165,32 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     curves = curves_dataset(chart.curves, *plane.names, run.model)
     told = effects_of(plane, changes, found, chart.curves, crossed, [one == 0 for one in others])
     variables = {**of_curves(curves, others, told), **of_lines(lines), **of_changes(plane, changes, found)}
+    variables |= of_searched(plane, searched)
     same = [(change.row, one.row) for change, one in zip(changes, found, strict=True) if one.row >= 0]
     pairs = np.array(same, int).reshape(-1, 2)
     variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines, pairs)
     return curves.assign(variables)
+
+
+def _searched(run: OpenRun, options: AtlasOptions, plane: Plane) -> list[Searched]:
+    """Search all orbits at some points of the grid."""
+    cube, base = run.cube(), parameters_of(run.cube())
+    cube = cube.sel(options.at) if options.at else cube
+    nodes = nodes_for(plane, options.isolas)
+    return [searched_at(plane, cube, node, base, options.curve_period) for node in track(nodes, "searching orbits")]
+
+
+def _hidden_ends(run: OpenRun, plane: Plane, searched: Sequence[Searched]) -> list[Located]:
+    """Return the bifurcations at which orbits end on which no cell ends."""
+    found = []
+    for number, (one, axis, end) in enumerate(followed_from(plane, searched, parameters_of(run.cube()))):
+        if end.what in KINDS and end.state is not None:
+            place = plane.values[one.node].copy()
+            place[axis] = end.value
+            near = end.error / plane.size[axis]
+            family = _family(run, plane, end.period)
+            found.append(Located(family, end.what, -2 - number, end.state, place, near if near > 1e-6 else 0.0))
+    return found
 
 
 def _verdicts(run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change]) -> list[Verdict]:
@@ -209,7 +234,12 @@ def _located(
 
 
 def _charted(
-    run: OpenRun, options: AtlasOptions, plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]
+    run: OpenRun,
+    options: AtlasOptions,
+    plane: Plane,
+    changes: Sequence[Change],
+    found: Sequence[Verdict],
+    hidden: Sequence[Located],
 ) -> Chart:
     """Continue the located bifurcations, and give each change the curve on which it lies."""
     own = [
@@ -217,7 +247,7 @@ def _charted(
         for k, one in enumerate(found)
         if one.what in (*KINDS, HOMOCLINIC, SNIC) and one.state is not None and one.period <= options.curve_period
     ]
-    located = _located(run, plane, changes, found, own)
+    located = [*_located(run, plane, changes, found, own), *hidden]
     margin = MARGIN * plane.size
     low, high = plane.low - margin, plane.low + plane.size + margin
     for axis, name in enumerate(plane.names):
@@ -225,7 +255,7 @@ def _charted(
             low[axis] = max(low[axis], 0.5 * plane.low[axis])
     bounds = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
     chart = charted(located, bounds, options.curve_period)
-    for k, curve in zip(own, chart.curve_of.tolist(), strict=True):
+    for k, curve in zip(own, chart.curve_of.tolist(), strict=False):
         found[k].curve = curve
     _agree(changes, found)
     on_edge = {(changes[k].edge, found[k].what): found[k] for k in own if found[k].curve >= 0}

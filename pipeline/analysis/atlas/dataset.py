@@ -12,7 +12,9 @@ from pipeline.analysis.atlas.effects import Effect
 from pipeline.analysis.atlas.ends import GOES_ON, SHRINKS, TOUCHES, End
 from pipeline.analysis.atlas.lines import Line
 from pipeline.analysis.atlas.plane import Array, Change, Plane
+from pipeline.analysis.atlas.searching import Searched
 from pipeline.analysis.atlas.verdicts import Verdict
+from pipeline.analysis.branches.searching import VERDICTS
 from pipeline.analysis.events.kinds import EVENTS
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import KINDS as SETS
@@ -59,6 +61,21 @@ def of_curves(curves: xr.Dataset, others: Sequence[Array], told: Sequence[Effect
         "n_crossed": ("curve", np.array([one.n_crossed for one in told], np.int32)),
         "n_effects": ("curve", np.array([one.n_effects for one in told], np.int32)),
         "effect": ("curve", np.array([one.why for one in told], object)),
+    }
+
+
+def of_searched(plane: Plane, searched: Sequence[Searched]) -> dict[str, Any]:
+    """Return the points at which all orbits were searched; nothing without any."""
+    if not searched:
+        return {}
+    places = plane.values[[one.node for one in searched]]
+    codes = np.array([VERDICTS.index(one.verdict) for one in searched], np.int8)
+    return {
+        "searched_first": ("searched", places[:, 0]),
+        "searched_second": ("searched", places[:, 1]),
+        "n_orbits": ("searched", np.array([one.n_orbits for one in searched], np.int32)),
+        "n_hidden": ("searched", np.array([len(one.hidden) for one in searched], np.int32)),
+        "index_verdict": ("searched", codes, code_flags(VERDICTS)),
     }
 
 

@@ -43,6 +43,12 @@ class AtlasOptions(SetEndOptions):
         unit="drive periods or returns",
         ge=1,
     )
+    isolas: int = option(
+        0,
+        "Number of points of the grid, evenly spaced, at which all orbits up to --curve-period are searched: those on "
+        "which no cell ends, as of detached branches, lead to further curves.",
+        ge=0,
+    )
 
 
 def _plane(role: str, dims: str, text: str) -> Columns:
@@ -135,6 +141,13 @@ ATLAS_COLUMNS: Columns = (
         effect="why no change is seen at the other pairs, or anywhere",
     ),
     *over("curve point", others_unstable="unstable multipliers beside the critical ones"),
+    *_plane("searched", "searched", "point at which all orbits were searched"),
+    *over(
+        "searched",
+        n_orbits="orbits found there",
+        n_hidden="stable ones of them on which no cell ends",
+        index_verdict="whether the indices of the orbits add up to what they must",
+    ),
     *over("line", line_what="what lies on the line", line_period="period of the orbit, 0 none"),
     *over("line", line_size="points of the line", n_tested="places at which it was named"),
     *_plane("line", "line vertex", "point of the line"),

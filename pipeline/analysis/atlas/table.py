@@ -63,7 +63,7 @@ def atlas_table(ds: xr.Dataset) -> Table:
     """Return the table of an atlas: a row for each change, and lines on regions, audit and curves."""
     return Table(
         _rows(ds),
-        [*_region_lines(ds), "", *_audit_lines(ds), "", *_curve_lines(ds)],
+        [*_region_lines(ds), "", *_audit_lines(ds), *_searched_lines(ds), "", *_curve_lines(ds)],
         header=("attractor_id", "set", "period", "what", "curve", "line", "cells", "why"),
     )
 
@@ -118,6 +118,16 @@ def _audit_lines(ds: xr.Dataset) -> list[str]:
     left = open_changes(ds)
     lines += [f"    {told_change(ds, k)}: {ds['why'].values[k]}" for k in left[:MOST]]
     return lines + ([f"    and {len(left) - MOST} more"] if len(left) > MOST else [])
+
+
+def _searched_lines(ds: xr.Dataset) -> list[str]:
+    if "searched" not in ds.dims:
+        return []
+    missing = int((ds["index_verdict"].values == words_of(ds["index_verdict"]).index("missing")).sum())
+    told = f"; at {counted(missing, 'point')} their indices show that some are missing" if missing else ""
+    n, hidden = ds.sizes["searched"], int(ds["n_hidden"].sum())
+    stable = f"{counted(hidden, 'stable orbit')} on which no cell ends"
+    return ["", f"all orbits were searched at {counted(n, 'point')}: {stable}{told}"]
 
 
 def _curve_lines(ds: xr.Dataset) -> list[str]:

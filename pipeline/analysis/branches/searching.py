@@ -117,11 +117,15 @@ def places_of(
     values = low + (high - low) * (np.arange(n) + 0.5) / max(n, 1)
     places = []
     for cells, where, family in rows_of(cube, parameters, parameter, high - low):
-        seen, reach, hindrance = sections_of(cells), _reach(cells, parameters), _hindrance(cells, parameters)
+        one = place_at(cells, parameters, family, np.nan)
         for value in values.tolist():
-            there = family_at(family, value)
-            places.append(Place(there, value, where, seen, reach, hindrance))
+            places.append(replace(one, family=family_at(family, value), value=value, where=where, found=[]))
     return places
+
+
+def place_at(cells: xr.Dataset, parameters: Parameters, family: Family, value: float) -> Place:
+    """Return the parameter point of a family at which orbits are searched, near the sections of some cells."""
+    return Place(family, value, {}, sections_of(cells), _reach(cells, parameters), _hindrance(cells, parameters))
 
 
 def rows_of(

@@ -1,0 +1,42 @@
+"""An atlas of a map with orbits on which no cell ends: they are stable within a circle of the plane."""
+
+import numpy as np
+
+from pipeline.runs.derive import derive
+from tests.pipeline.analysis.cubes import line, sweep
+
+RADIUS = 0.3
+DETACHED = {
+    "name": "detached",
+    "kind": "map",
+    "states": {"x": {"scale": 1.0}},
+    "parameters": {"p": 0.5, "q": 0.5},
+    # fixed points: -2, and both roots of x^2 + (p - .5)^2 + (q - .5)^2 = .09, the upper one stable
+    "equations": {"x": "x - 0.1*(x + 2)*(x^2 + (p - 0.5)^2 + (q - 0.5)^2 - 0.09)"},
+}
+SPEC = {
+    **sweep(
+        DETACHED,
+        {"kind": "random", "n": 4, "seed": 1, "x": [-3.0, -1.2]},
+        axes={"p": line(0.0, 1.0, 7), "q": line(0.0, 1.0, 7)},
+        lengths=(100, 8),
+    ),
+    "integration": {"n_transient": 100, "n_keep": 8},
+}
+
+
+def test_orbits_of_an_isola_are_found_where_all_are_searched(computed):
+    """The fold is the circle; its region has the area pi r^2, and no cell shows the orbit there."""
+    run = computed(SPEC)
+    plain = derive(run, "atlas")
+    assert (plain.sizes["region"], plain.sizes["curve"]) == (1, 0)
+    found = derive(run, "atlas", {"isolas": 9, "curve_period": 1})
+    assert found["n_hidden"].values.sum() == found["n_hidden"].values.max() == 1
+    assert found["n_orbits"].values[4] == 3
+    assert found.sizes["curve"] == 1
+    n = int(found["n_points"][0])
+    p, q = found["p"].values[0, :n], found["q"].values[0, :n]
+    np.testing.assert_allclose(np.hypot(p - 0.5, q - 0.5), RADIUS, atol=1e-7)
+    np.testing.assert_allclose(found["area"].values[1], np.pi * RADIUS**2, rtol=2e-3)
+    assert found["n_effects"].values[0] == 0
+    assert "no cell finds the stable orbit" in str(found["effect"].values[0])
