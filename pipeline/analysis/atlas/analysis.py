@@ -16,7 +16,7 @@ from pipeline.analysis.atlas.ends import End, at_node, follow_all, start_of
 from pipeline.analysis.atlas.further import Wanted, wanted, with_further
 from pipeline.analysis.atlas.further import dataset_of as further_dataset
 from pipeline.analysis.atlas.lines import Key, Line, lines_through
-from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, pairs_on, plane_of
+from pipeline.analysis.atlas.plane import Array, Change, Plane, changes_of, continued, pairs_on, plane_of
 from pipeline.analysis.atlas.regions import variables_of_regions
 from pipeline.analysis.atlas.searching import Searched, followed_from, nodes_for, searched_at
 from pipeline.analysis.atlas.verdicts import Verdict, verdicts
@@ -167,6 +167,7 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     variables = {**of_curves(curves, others, told), **of_lines(lines), **of_changes(plane, changes, found)}
     variables |= of_searched(plane, searched)
     same = [(change.row, one.row) for change, one in zip(changes, found, strict=True) if one.row >= 0]
+    same += [(row, heir) for (row, _), heir in continued(plane).items()]
     pairs = np.array(same, int).reshape(-1, 2)
     variables |= variables_of_regions(plane, tracks, [one == 0 for one in others], lines, pairs)
     return curves.assign(variables)
@@ -304,8 +305,8 @@ def _agree(changes: Sequence[Change], found: Sequence[Verdict]) -> None:
 
 
 def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> list[Line]:
-    """Join the changes that lie on no curve, and give each its line."""
-    own = [k for k, one in enumerate(found) if one.curve < 0 and one.is_seen and one.what != LIVES_ON]
+    """Join the changes that are explained and lie on no curve, and give each its line."""
+    own = [k for k, v in enumerate(found) if v.curve < 0 and v.is_seen and v.what not in (UNDECIDED, LIVES_ON)]
     items: list[tuple[int, Key, Array]] = [
         (
             int(plane.parent[changes[k].edge]),

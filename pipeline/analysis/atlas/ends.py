@@ -13,7 +13,7 @@ from pipeline.analysis.atlas.plane import Plane
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.bifurcations import Bifurcation, n_unstable
 from pipeline.analysis.branches.exploring import first_of
-from pipeline.analysis.branches.following import Branch, half_branch, half_orbit, opposite, problem_of
+from pipeline.analysis.branches.following import Branch, first_point, half_branch, half_orbit, opposite, problem_of
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, LIMITS
 from pipeline.analysis.branches.known import Start, at_value
 from pipeline.analysis.branches.limits import settle_limits
@@ -89,6 +89,10 @@ def _towards(start: Start, target: float) -> Steps[Branch | None]:
     if found is None:
         return None
     family, point = found
+    if n_unstable(point) and family.period != start.family.period:
+        # just beyond a doubling the orbit of half the period, which is not stable, is as near as the errors
+        family, longer = start.family, (yield from first_point(problem_of(start.family), start.unknowns, TRACE))
+        point = longer or point
     if n_unstable(point) == 0 and (there := (yield from _at_once(family, point, target))) is not None:
         return Branch(family, [point, there], [], ("start", "bound"))
     # the starting orbit lies on no bound: its value is known up to rounding

@@ -11,7 +11,7 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import wrap_angles
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import dims_of, point_of_rows, points_of_rows
 from pipeline.results.selection import choose, start_dims
@@ -44,6 +44,7 @@ class Plane:
     n_cells: Array  # (node,): cells
     n_known: Array  # (node,): cells with a known outcome
     sets: xr.Dataset  # the sets on the grid
+    labels: Array  # (node of the grid, cell): outcome of each cell, see `outcomes`
     # of each row
     node: Array
     attractor: Array  # id
@@ -91,8 +92,8 @@ def plane_of(found: xr.Dataset, names: tuple[str, str], at: Mapping[str, float] 
     own = place if dims_of(part) == names else place.T
     rows = np.flatnonzero(part["stability"].values == ATTRACTS)
     values = np.stack(np.meshgrid(*(np.sort(one) for one in axes), indexing="ij"), axis=-1).reshape(-1, 2)
-    is_known = (outcomes(part) != -1).transpose(*names, ...).values.reshape(*shape, -1)
-    known = is_known.sum(axis=-1)[np.ix_(*order)].ravel()
+    labels = outcomes(part).transpose(*names, ...).values.reshape(*shape, -1)[np.ix_(*order)]
+    labels = labels.reshape(len(values), -1)
     edges = [np.stack([number[:-1].ravel(), number[1:].ravel()], axis=-1)]
     edges += [np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=-1)]
     return Plane(
@@ -102,9 +103,10 @@ def plane_of(found: xr.Dataset, names: tuple[str, str], at: Mapping[str, float] 
         np.concatenate(edges),
         np.arange(sum(map(len, edges))),
         np.zeros(sum(map(len, edges)), bool),
-        np.full(len(known), is_known.shape[-1]),
-        known,
+        np.full(len(labels), labels.shape[1]),
+        (labels != -1).sum(axis=1),
         part,
+        labels,
         own.ravel()[point_of_rows(part)[rows]],
         *columns_of(part, rows),
     )
@@ -129,17 +131,45 @@ def changes_of(plane: Plane, system: System) -> list[Change]:
     alike = np.stack([plane.kind, plane.period], axis=-1).tolist()
     found: list[Change] = []
     pairs: list[Change] = []
+    same = continued(plane)
     for edge in np.flatnonzero(~plane.is_parted).tolist():
         a, b = plane.edges[edge].tolist()
         for number in sorted(at[a].keys() | at[b].keys()):
             rows = at[a].get(number, -1), at[b].get(number, -1)
             if rows[0] < 0:
-                found.append(Change(edge, b, a, rows[1], -1))
+                found += [Change(edge, b, a, rows[1], -1)] if (rows[1], a) not in same else []
+            elif rows[1] < 0 and (rows[0], b) in same:
+                continue
             elif rows[1] < 0 or alike[rows[0]] != alike[rows[1]]:
                 found += _both_ways(edge, a, b, rows)
             elif plane.kind[rows[0]] not in APERIODIC:
                 pairs.append(Change(edge, a, b, *rows))
     return sorted([*found, *_jumps(plane, pairs, system)])
+
+
+def continued(plane: Plane) -> dict[tuple[int, int], int]:
+    """Find sets other than orbits that go on at a neighbouring point of the grid under another id: all cells of each
+    are there on the other. Return the row there by row and neighbour.
+    """
+    numbers = {(int(n), int(i)): row for row, (n, i) in enumerate(zip(plane.node, plane.attractor, strict=True))}
+    own = np.flatnonzero(np.isin(plane.kind, APERIODIC) & (plane.node < len(plane.labels)))
+    found: dict[tuple[int, int], int] = {}
+    beside: dict[int, list[int]] = {}
+    for a, b in plane.edges[: plane.parent.max() + 1].tolist():
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    for row in own.tolist():
+        node, number = int(plane.node[row]), int(plane.attractor[row])
+        for other in beside.get(node, []):
+            here, there = plane.labels[node], plane.labels[other]
+            to = set(there[here == number].tolist()) - {-1}
+            heir = numbers.get((other, next(iter(to))), -1) if len(to) == 1 else -1
+            if heir < 0 or plane.kind[heir] not in APERIODIC:
+                continue
+            kinds = {int(plane.kind[row]), int(plane.kind[heir])} - {BOUNDED_SET}
+            if len(kinds) < 2 and set(here[there == plane.attractor[heir]].tolist()) - {-1} == {number}:
+                found[row, other] = heir
+    return found
 
 
 def pairs_on(plane: Plane, edge: int, period: int) -> list[Change]:

@@ -14,7 +14,6 @@ from pipeline.analysis.atlas.arrangement import Arrangement, arranged
 from pipeline.analysis.atlas.further import SEEN
 from pipeline.analysis.atlas.lines import Line
 from pipeline.analysis.atlas.plane import Array, Plane
-from pipeline.analysis.events.kinds import UNDECIDED
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.layout.vocabulary import KINDS as SETS
@@ -46,7 +45,7 @@ def variables_of_regions(
             owner.append(number)
             parts.append(part)
     for number, line in enumerate(lines, len(tracks)):
-        if len(line.places) > 1 and line.what != UNDECIDED:
+        if len(line.places) > 1:
             owner.append(number)
             parts.append(plane.scaled(line.places))
     tolerances = [_bend(part) for part in parts]

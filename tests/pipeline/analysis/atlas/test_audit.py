@@ -38,6 +38,7 @@ def plane_with(shape, sets):
         np.full(len(values), 10),
         np.full(len(values), 10),
         xr.Dataset(),
+        np.zeros((0, 10), int),
         np.array(node),
         np.array(ids),
         np.array(kinds),
