@@ -258,7 +258,7 @@ def _charted(
     chart = charted(located, bounds, options.curve_period)
     for k, curve in zip(own, chart.curve_of.tolist(), strict=False):
         found[k].curve = curve
-    _agree(changes, found)
+    _agree(plane, changes, found)
     on_edge = {(changes[k].edge, found[k].what): found[k] for k in own if found[k].curve >= 0}
     for one, change in zip(found, changes, strict=True):  # a torus begins at the bifurcation that ends an orbit
         if one.curve < 0 and one.state is None and (other := on_edge.get((change.edge, one.what))) is not None:
@@ -291,17 +291,25 @@ def _look_again(
         found.append(more[k])
 
 
-def _agree(changes: Sequence[Change], found: Sequence[Verdict]) -> None:
-    """Give the ends at one crossing of a curve with an edge the place that is known best; in place."""
-    best: dict[tuple[int, int], Verdict] = {}
+def _agree(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> None:
+    """Give the ends at one crossing of a curve with an edge the place that is known best; in place.
+
+    A curve may cross an edge twice, as the two folds beside a cusp do: places agree within their errors.
+    """
+    rounding = 1e-9
+    crossed: dict[tuple[int, int], list[Verdict]] = {}
     for change, one in zip(changes, found, strict=True):
-        key = change.edge, one.curve
-        if one.curve >= 0 and (key not in best or one.error < best[key].error):
-            best[key] = one
-    for change, one in zip(changes, found, strict=True):
-        known = best.get((change.edge, one.curve))
-        if known is not None and known is not one and known.error < one.error:
-            one.place, one.error = known.place, known.error
+        if one.curve >= 0:
+            crossed.setdefault((change.edge, one.curve), []).append(one)
+    for own in crossed.values():
+        best: list[Verdict] = []
+        for one in sorted(own, key=lambda verdict: verdict.error):
+            away = [np.linalg.norm(plane.scaled(one.place) - plane.scaled(other.place)) for other in best]
+            if away and min(away) <= 2.0 * one.error + rounding:
+                known = best[int(np.argmin(away))]
+                one.place, one.error = known.place, known.error
+            else:
+                best.append(one)
 
 
 def _lines(plane: Plane, changes: Sequence[Change], found: Sequence[Verdict]) -> list[Line]:

@@ -13,7 +13,15 @@ from pipeline.analysis.atlas.plane import Plane
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.bifurcations import Bifurcation, n_unstable
 from pipeline.analysis.branches.exploring import first_of
-from pipeline.analysis.branches.following import Branch, first_point, half_branch, half_orbit, opposite, problem_of
+from pipeline.analysis.branches.following import (
+    Branch,
+    first_point,
+    half_branch,
+    half_orbit,
+    half_way,
+    opposite,
+    problem_of,
+)
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, LIMITS
 from pipeline.analysis.branches.known import Start, at_value
 from pipeline.analysis.branches.limits import settle_limits
@@ -142,6 +150,8 @@ def _end(branch: Branch | None, target: float) -> End:
     lost = _lost(branch)
     if n_unstable(branch.points[0]):
         return End(UNDECIDED, why="the orbit on which cells end is not stable")
+    if (halved := _halved(branch, lost[0] if lost else None)) is not None:
+        return halved
     if lost:
         one = lost[0]
         value = float(family.values(one.point.u)[0])
@@ -160,6 +170,26 @@ def _end(branch: Branch | None, target: float) -> End:
     if end in WHAT:
         return End(WHAT[end], value, abs(value - float(branch.values[-2])), family.period, family.state(last.u))
     return _touch(branch) or End(UNDECIDED, value, np.nan, family.period, family.state(last.u), why=_why(branch))
+
+
+def _halved(branch: Branch, lost: Bifurcation | None) -> End | None:
+    """Return the end of an orbit that shrinks onto one of half its period: where it turns back there, or where a step
+    led along the shorter orbit.
+    """
+    family, points = branch.family, branch.points
+    if not family.period or family.period % 2:
+        return None
+    merged = 0.01  # of the first distance between section points half a period apart
+    first = np.linalg.norm(half_way(family, points[0]))
+    last = len(points) if lost is None else lost.after + 1
+    passed = (k for k in range(1, last) if np.linalg.norm(half_way(family, points[k])) < merged**2 * first)
+    if (k := next(passed, -1)) > 0:
+        state, value = half_orbit(family, points[k - 1])
+        return End(DOUBLING, value, abs(float(branch.values[k]) - value), family.period // 2, state)
+    if lost is not None and np.linalg.norm(half_way(family, lost.point)) < merged * first:
+        state, value = half_orbit(family, lost.point)
+        return End(DOUBLING, value, lost.bracket, family.period // 2, state)
+    return None
 
 
 def _touch(branch: Branch) -> End | None:

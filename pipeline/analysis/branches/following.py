@@ -175,12 +175,13 @@ def has_halved(family: Family, points: list[Point]) -> bool:
     near_half, passed = 0.2, 4.0
     if not family.period or family.period % 2 or len(points) < 2:
         return False
-    before, here = (_half_way(family, p) for p in points[-2:])
+    before, here = (half_way(family, p) for p in points[-2:])
     near = max(near_half, passed * float(np.linalg.norm(points[-1].u - points[-2].u)))
     return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < near)
 
 
-def _half_way(family: Family, point: Point) -> np.ndarray:
+def half_way(family: Family, point: Point) -> np.ndarray:
+    """Return the scaled distance to the section point half a period later."""
     return family.mismatch(point.u, point.value.images[family.period // 2 - 1])
 
 
@@ -189,7 +190,7 @@ def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
     reached.
     """
     u = point.u.copy()
-    u[:-1] += 0.5 * _half_way(family, point)
+    u[:-1] += 0.5 * half_way(family, point)
     return family.state(u), float(family.values(u)[0])
 
 
