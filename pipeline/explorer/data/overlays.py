@@ -23,7 +23,16 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import finite, parts_of, share_bounds, shown
 from pipeline.explorer.data.verticals import vertical
 from pipeline.explorer.data.view import can_have
-from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, KINDS, PERIODIC_ORBIT, letter, model_of
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BRANCH,
+    EQUILIBRIUM,
+    FREQUENCY_DIM,
+    KINDS,
+    PERIODIC_ORBIT,
+    letter,
+    model_of,
+)
 from pipeline.plots import palette
 from pipeline.plots.labels import state_measure
 from pipeline.results.outcomes import outcomes, share_interval
@@ -223,7 +232,8 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the attractors and other sets at a parameter point, the largest basin fraction first.
 
-    ``cell`` is the number of a cell on each; ``note`` says how to get them, where they are not known.
+    ``cell`` is the number of a cell on each; None of an equilibrium of a flow, whose cells never meet the section.
+    ``note`` says how to get them, where they are not known.
     """
     explored = ExploredRun.open(run)
     place = explored.place(at)
@@ -234,9 +244,11 @@ def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     here = dense(isel(found, place), points=True)
     present = np.flatnonzero(here["kind"].values > 0).tolist()
     ids = outcomes(isel(found, place))
-    listed = [
-        {**_set(explored, here.isel(attractor=i), i, cast), "cell": _cell_on(explored, ids, i, place)} for i in present
-    ]
+    listed = []
+    for i in present:
+        rests = int(here["kind"][i]) == EQUILIBRIUM and run.model.crossing is not None
+        cell = None if rests else _cell_on(explored, ids, i, place)
+        listed.append({**_set(explored, here.isel(attractor=i), i, cast), "cell": cell})
     return {"attractors": sorted(listed, key=lambda a: -(a["share"] or 0.0)), "note": None}
 
 

@@ -14,9 +14,10 @@ from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.view import describe_view
 from pipeline.layout.own_words import with_plain_names
 from pipeline.results.ragged import dense
-from pipeline.runs.derive import stored
+from pipeline.runs.derive import derive, stored
 from pipeline.store.run import RunDirectory
 from tests.pipeline.analysis.atlas.test_figure import made_up
+from tests.pipeline.factories import finished
 
 
 def explored_plane():
@@ -93,6 +94,27 @@ def test_plane__points_and_their_attractors(plane_with_atlas):
         assert {one["id"] for one in here} == set(ids[a, b]) - {-1}
         assert all(ids.ravel()[one["cell"]] == one["id"] for one in here)
         assert all(one["cell"] // 6 == a * 2 + b for one in here)
+
+
+RESTING = """
+kind = "sweep"
+section = { of = "x", value = 0.0, direction = "up", longest = 50.0 }
+axes = { a = { values = [0.0] }, b = { values = [0.5] } }
+initial_conditions = { kind = "random", n = 6, seed = 1, x = [-1.5, 1.5] }
+integration = { rtol = 1e-8, atol = 1e-8, n_transient = 100, n_keep = 8 }
+model.name = "cusp"
+model.states = { x = {} }
+model.parameters = { a = 0.0, b = 0.5 }
+model.equations = { x = "a + b*x - x**3" }
+"""
+
+
+@pytest.mark.slow
+def test_attractors__equilibria_of_a_flow_have_no_cell_with_an_orbit(tmp_path):
+    directory = finished(tmp_path, RESTING)
+    derive(directory, "attractors")
+    here = attractors(RunDirectory.open(directory), {"a": 0, "b": 0})["attractors"]
+    assert [(one["kind"], one["cell"]) for one in here] == [("equilibrium", None)] * 2
 
 
 @pytest.mark.slow

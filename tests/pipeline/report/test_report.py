@@ -10,6 +10,8 @@ import shutil
 
 import pytest
 
+from pipeline.analysis.atlas.sentences import sentences
+from pipeline.layout.own_words import in_own_words
 from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.report.report import stored_options
 from pipeline.results.outcomes import sentence
@@ -124,6 +126,29 @@ def test_report__its_commands_work(folder, command):
     for c in mine:
         _, notes = command(folder, *shlex.split(c)[1:])
         assert not re.search(r": computed", notes), c
+
+
+PLANE = """
+kind = "sweep"
+model = "henon"
+axes.a = { values = [1.0, 1.1, 1.2] }
+axes.b = { values = [0.2, 0.3] }
+initial_conditions = { kind = "random", n = 6, seed = 1, x = [-0.5, 0.5], y = [-0.2, 0.2] }
+integration = { n_transient = 1000, n_keep = 64, stop_when_closed = true, closure_tolerance = 1e-8 }
+"""
+
+
+def test_report__of_an_atlas(command, tmp_path):
+    run = finished(tmp_path, PLANE)
+    assert "magpend analyse atlas run" in written(command, tmp_path, "run", "--only-stored")
+    found = derive(run, "atlas", {"windows": 0, "curve_period": 2})
+    html = markup.unescape(written(command, tmp_path, "run", "--only-stored"))
+    told = sentences(in_own_words(found))
+    assert any(text.startswith("Not explained: ") for text in told)
+    for text in told:
+        assert f"<p>{text}</p>" in html
+    assert re.search(r"magpend plot atlas run .*--windows 0", html)
+    assert re.search(r"magpend analyse atlas run .*--windows 0", html)
 
 
 def test_stored_options__of_these_cells(folder, tmp_path):

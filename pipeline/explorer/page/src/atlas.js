@@ -95,7 +95,8 @@ export class Atlas {
       const found = await this.plane.source.attractors({ at });
       if (asked !== this.asked) return;
       const there = found.attractors.filter(({ cell }) => cell !== null);
-      this.tell([...parts, el("p", { text: `Orbits at ${this.words(at)}, the nearest point with cells:` })], there.map(({ name, cell }) => [name, at, cell]));
+      const told = there.length ? "Orbits at" : "No orbit meets the section at";
+      this.tell([...parts, el("p", { text: `${told} ${this.words(at)}, the nearest point with cells${there.length ? ":" : "."}` })], there.map(({ name, cell }) => [name, at, cell]));
     } catch (error) {
       if (asked === this.asked) this.tell([...parts, el("p", { text: error.message })], []);
     }
@@ -144,11 +145,13 @@ export class Atlas {
   }
 
   paintLines(ctx, frame, colours) {
-    ctx.strokeStyle = colours.ink;
-    ctx.lineWidth = 1.2;
-    ctx.setLineDash([1.5, 3]);
     frame.trace(ctx, this.lines.map(({ x, y }) => x.flatMap((value, i) => [value, y[i]])));
-    ctx.stroke();
+    for (const [width, colour, dashes] of [[3, colours.card, []], [1.2, colours.ink, [1.5, 3]]]) {
+      ctx.lineWidth = width;
+      ctx.strokeStyle = colour;
+      ctx.setLineDash(dashes);
+      ctx.stroke();
+    }
     ctx.setLineDash([]);
     for (const [width, colour] of [[4, colours.card], [1.8, colours.ink]]) {
       ctx.beginPath();
@@ -173,9 +176,11 @@ export class Atlas {
       ctx.beginPath();
       ctx.arc(frame.x(this.marks[mark].x), frame.y(this.marks[mark].y), 8, 0, 2 * Math.PI);
     }
-    ctx.lineWidth = 2.4;
-    ctx.strokeStyle = colours.accent;
-    ctx.stroke();
+    for (const [width, colour] of [[5, colours.card], [2.4, colours.accent]]) {
+      ctx.lineWidth = width;
+      ctx.strokeStyle = colour;
+      ctx.stroke();
+    }
   }
 }
 
