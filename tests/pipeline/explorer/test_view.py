@@ -123,8 +123,8 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
 
 @pytest.mark.slow
 def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made):
-    # of what a run of two parameters is to be followed along, a person has to say
-    assert describe_view(ExploredRun.open(sweep), False)["commands"] == {}
+    # of what a run of two parameters is to be followed along, a person has to say; an atlas takes both
+    assert describe_view(ExploredRun.open(sweep), False)["commands"].keys() == {"atlas"}
     assert "basins" not in describe_view(ExploredRun.open(walk), False)["commands"]  # a walk has no basins
     assert {"attractors", "basins"} <= describe_view(ExploredRun.open(made.info.directory), False)["commands"].keys()
 
