@@ -194,11 +194,11 @@ def curve_errors(ds: Any, orbits_of: Callable[[str, int], Any], every: int = 1) 
             continue
         values = np.stack([ds[w].values[number, :n] for w in names], axis=-1)
         states = np.array([orbits.start(x) for x in ds["section"].values[number, :n]])
-        found[number] = _distance(orbits, kind, states[::every], values[::every], np.asarray(span))
+        found[number] = distance(orbits, kind, states[::every], values[::every], np.asarray(span))
     return found
 
 
-def _distance(orbits: Any, kind: str, x: np.ndarray, p: np.ndarray, span: np.ndarray) -> float:
+def distance(orbits: Any, kind: str, x: np.ndarray, p: np.ndarray, span: np.ndarray) -> float:
     """Return the largest distance of points from a bifurcation, along the nearer of both parameters."""
     away = []
     with np.errstate(all="ignore"):
