@@ -40,3 +40,16 @@ def test_orbits_of_an_isola_are_found_where_all_are_searched(computed):
     np.testing.assert_allclose(found["area"].values[1], np.pi * RADIUS**2, rtol=2e-3)
     assert found["n_effects"].values[0] == 0
     assert "no cell finds the stable orbit" in str(found["effect"].values[0])
+
+
+def test_budget__is_spent_on_a_region_that_few_cells_know(computed):
+    """The one region has 49 points of 4 cells: 107 starts at its middle make 299, and no round follows."""
+    run = computed(SPEC)
+    plain, more = derive(run, "atlas"), derive(run, "atlas", {"budget": 1000})
+    assert (plain["region_cells"].values.tolist(), plain["is_thin"].values.tolist()) == ([196], [1])
+    assert (more["region_cells"].values.tolist(), more["is_thin"].values.tolist()) == ([299], [0])
+    assert (plain.sizes["change"], more.sizes["change"]) == (0, 0)
+    further = derive(run, "further", {"budget": 1000})
+    assert (further["point_cells"].values.tolist(), further["at_node"].values.tolist()) == ([107], [24])
+    low = derive(run, "atlas", {"budget": 100})
+    assert low["region_cells"].values.tolist() == [196]
