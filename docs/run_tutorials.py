@@ -53,6 +53,7 @@ GALLERY = DOCS / "gallery"
 COLOURS = 128
 """Colours in a picture of the gallery."""
 NOT_MADE = {
+    "atlas-tongues.png": "Arnold tongues, two minutes, by the command beside it",
     "branches-map.png": "curves over a map of two parameters, a quarter of an hour",
     "examples/flutter-bands.png": "bands of the flutter rig's fit with priors, which no specification that ships has",
     "explorer-notebook.png": "JupyterLab with the explorer, by docs/notebook_picture.py RUN FILE",
@@ -62,6 +63,7 @@ NOT_MADE = {
     "report.png": "a browser's picture of a part of a report",
     "response-pendulum.png": "the response of the pendulum, half a minute, by the commands beside it",
     "rig-calibrated.png": "a diagram of the calibrated model of docs/rig.md beside the rig's",
+    "tutorials/atlas.png": "the atlas of the pendulum, a quarter of an hour, by the commands beside it",
     "tutorials/events_0p1_2hz.png": "the same between 0.1 and 2 Hz, half an hour",
     "tutorials/events_2_3hz.png": "bars of the pendulum's attractors, ten minutes, by docs/pendulum_events.py",
 }

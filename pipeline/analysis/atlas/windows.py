@@ -15,7 +15,7 @@ from pipeline.analysis.events.kinds import LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.events.windows import events_within
 from pipeline.layout.vocabulary import APERIODIC, parameter_name
 from pipeline.results.ragged import isel
-from pipeline.results.tabular import words_of
+from pipeline.results.tabular import counted, words_of
 
 BESIDE = 1
 """Points of a window beyond the two between which a set ends, on each side."""
@@ -86,8 +86,8 @@ def carried(lines: Sequence[Line], found: Sequence[Verdict], tested: Sequence[in
             one.what, one.why = UNDECIDED, NO_WINDOW
             if len(whats) == 1 and len(beside) == min(2, len(places)):
                 one.what = whats.pop()
-                one.why = f"as at {len(beside)} neighbouring places of its line, where it was named"
+                one.why = f"as at {counted(len(beside), 'neighbouring place')} of its line, where it was named"
                 if one.what == UNDECIDED:
-                    one.why = f"at {len(beside)} neighbouring places of its line it was not decided"
+                    one.why = f"at {counted(len(beside), 'neighbouring place')} of its line it was not decided"
             elif len(whats) > 1:
                 one.why = f"the neighbouring places of its line were named differently: {', '.join(sorted(whats))}"

@@ -169,6 +169,23 @@ def test_run__plot_of_two_parameters_draws_a_diagram_and_says_what_is_left(main,
 
 
 @pytest.mark.slow
+def test_atlas__runs_analyses_and_draws_a_specification_or_its_run(main, tmp_path):
+    code, out, err = main("atlas", "tongues", "--smoke", "--workers", "0", "--json", "audit.json")
+    assert code == 0, err
+    assert re.search(r"^\d+ regions?, \d+ curves?, \d+ lines?", out)
+    assert "changes of attractors between neighbouring points" in out
+    assert out.splitlines()[-2].startswith("figure: runs/tongues-smoke/figures/atlas_")
+    rows = json.loads((tmp_path / "audit.json").read_text())
+    assert {row["what"] for row in rows} & {"fold", "not_decided"}
+    code, again, err = main("atlas", tmp_path / "runs" / "tongues-smoke")
+    assert code == 0, err
+    assert again.splitlines()[0] == out.splitlines()[0]
+    code, _, err = main("analyse", "atlas", tmp_path / "runs" / "tongues-smoke", "--parameter", "K", "--second", "K")
+    assert code == Exit.REFUSED
+    assert "give two parameters" in err
+
+
+@pytest.mark.slow
 def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path, monkeypatch):
     write_spec(walk_text + "\n[smoke]\ninitial_conditions.n = 2\n")
     words, directory = ("run", "spec.toml", "--smoke", "--workers", "0"), tmp_path / "runs" / "spec-smoke"
