@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,10 @@ from pipeline.analysis.branches.problems import TESTS, Family
 
 Key = tuple[str, int]
 """Kind of a bifurcation, and the period of the orbit."""
+
+PLANE_CURVE = replace(CURVE, max_points=200)
+"""Settings of curves: one that needs more points to cross the plane crawls, and the bifurcations beyond start another.
+"""
 
 TRIES = 3
 """Most starts of one attractor's bifurcations of a kind and period that lead to no curve."""
@@ -128,7 +132,7 @@ class Chart:
                 for i in chosen:  # bifurcations of this kind have no curve
                     tried[(*self.located[i].key, self.located[i].attractor)] = TRIES
                 continue
-            found = continue_curves(starts, bounds, CURVE, longest, generations, self.lost, self.curves)
+            found = continue_curves(starts, bounds, PLANE_CURVE, longest, generations, self.lost, self.curves)
             self.curves += found
             self._settle(found)
             for i in chosen:
