@@ -50,6 +50,11 @@ def settle_plane(run: OpenRun, options: Given) -> Given:
             )
     if axis_name(names[0]) == axis_name(names[1]):
         raise SpecError(f"--parameter and --second are both {in_words(run, names[0])}; give two parameters.")
+    known = {axis_name(name) for name in (*names, *options.at)}
+    for name in run.spec.axes:
+        if axis_name(name) not in known and (axis := swept_axis(run, name)) is not None:
+            told = f"the run also sweeps {in_words(run, name)} ({axis.size} values)"
+            raise SpecError(f"{told}; choose one of them: --at {in_words(run, name)}=VALUE.")
     return options
 
 

@@ -1,8 +1,10 @@
 """An atlas of a map with orbits on which no cell ends: they are stable within a circle of the plane."""
 
 import numpy as np
+import pytest
 
 from pipeline.runs.derive import derive
+from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import line, sweep
 
 RADIUS = 0.3
@@ -10,9 +12,9 @@ DETACHED = {
     "name": "detached",
     "kind": "map",
     "states": {"x": {"scale": 1.0}},
-    "parameters": {"p": 0.5, "q": 0.5},
+    "parameters": {"p": 0.5, "q": 0.5, "r": 0.09},
     # fixed points: -2, and both roots of x^2 + (p - .5)^2 + (q - .5)^2 = .09, the upper one stable
-    "equations": {"x": "x - 0.1*(x + 2)*(x^2 + (p - 0.5)^2 + (q - 0.5)^2 - 0.09)"},
+    "equations": {"x": "x - 0.1*(x + 2)*(x^2 + (p - 0.5)^2 + (q - 0.5)^2 - r)"},
 }
 SPEC = {
     **sweep(
@@ -53,3 +55,16 @@ def test_budget__is_spent_on_a_region_that_few_cells_know(computed):
     assert (further["point_cells"].values.tolist(), further["at_node"].values.tolist()) == ([107], [24])
     low = derive(run, "atlas", {"budget": 100})
     assert low["region_cells"].values.tolist() == [196]
+
+
+def test_further_axes__need_a_value(computed):
+    axes = {"p": line(0.0, 1.0, 3), "q": line(0.0, 1.0, 2), "r": line(0.05, 0.09, 2)}
+    run = computed({**SPEC, "axes": axes})
+    with pytest.raises(SpecError, match=r"also sweeps r \(2 values\); choose one of them: --at r=VALUE"):
+        derive(run, "atlas")
+    found = derive(run, "atlas", {"at": {"r": 0.09}})
+    assert found["region_points"].values.tolist() == [6]
+    with pytest.raises(SpecError, match="both p; give two parameters"):
+        derive(run, "atlas", {"parameter": "p", "second": "p"})
+    with pytest.raises(SpecError, match="a plane needs a sweep over two parameters"):
+        derive(computed({**SPEC, "axes": {"p": axes["p"]}}), "atlas")
