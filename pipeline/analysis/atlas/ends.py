@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from pipeline.analysis.branches.following import (
     opposite,
     problem_of,
 )
-from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, LIMITS
+from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, LIMITS
 from pipeline.analysis.branches.known import Start, at_value
 from pipeline.analysis.branches.limits import settle_limits
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
@@ -89,7 +89,29 @@ def follow_all(starts: Sequence[tuple[Start, float]], what: str = "") -> list[En
     found = [branch for branch in branches if branch is not None]
     settle_limits(found)
     judge([(b.family, one) for b in found for one in _lost(b)[:1] if one.kind == BRANCHING])
-    return [_end(branch, target) for branch, (_, target) in zip(branches, starts, strict=True)]
+    ends = [_end(branch, target) for branch, (_, target) in zip(branches, starts, strict=True)]
+    shrunk = [k for k, one in enumerate(ends) if one.what == SHRINKS]
+    for k, end in zip(shrunk, run_together([_hopf_at(branches[k], ends[k]) for k in shrunk]), strict=True):
+        ends[k] = end
+    return ends
+
+
+def _hopf_at(branch: Branch, cycle: End) -> Steps[End]:
+    """Return the Hopf point at which cycles shrink to an equilibrium; their end itself if there is none nearby."""
+    near = 0.05  # largest distance of the Hopf point from the last cycle [scale of the parameter]
+    family = replace(branch.family, period=0)
+    assert cycle.state is not None
+    u = family.unknowns(cycle.state, [cycle.value])
+    point = yield from first_point(problem_of(family), u, Settings())
+    found = []
+    for way in () if point is None else (opposite(point), point):
+        bounds = (cycle.value + sign * near * family.scales[0] for sign in (-1.0, 1.0))
+        half = yield from half_branch(family, way, *bounds, Settings())
+        found += [one for one in half.bifurcations if one.kind == HOPF]
+    if not found:
+        return cycle
+    one = min(found, key=lambda one: abs(one.point.u[-1] - u[-1]))
+    return End(HOPF, float(family.values(one.point.u)[0]), one.bracket, 0, family.state(one.point.u))
 
 
 def _towards(start: Start, target: float) -> Steps[Branch | None]:
@@ -244,6 +266,7 @@ def _beside(family: Family, u: np.ndarray, bounds: tuple[float, float]) -> Steps
         half = yield from half_branch(family, way, *bounds, TRACE, from_bifurcation=True)
         points = half.trace.points
         if len(points) > 2 and not n_unstable(points[1]):
-            branch = Branch(family, points[1:], half.bifurcations, ("start", half.trace.end))
+            passed = [replace(one, after=one.after - 1) for one in half.bifurcations]
+            branch = Branch(family, points[1:], passed, ("start", half.trace.end))
             found.append((branch, bounds[int(branch.values[-1] > branch.values[0])]))
     return found
