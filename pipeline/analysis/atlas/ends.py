@@ -90,8 +90,9 @@ def follow_all(starts: Sequence[tuple[Start, float]], what: str = "") -> list[En
     settle_limits(found)
     judge([(b.family, one) for b in found for one in _lost(b)[:1] if one.kind == BRANCHING])
     ends = [_end(branch, target) for branch, (_, target) in zip(branches, starts, strict=True)]
-    shrunk = [k for k, one in enumerate(ends) if one.what == SHRINKS]
-    for k, end in zip(shrunk, run_together([_hopf_at(branches[k], ends[k]) for k in shrunk]), strict=True):
+    shrunk = {k: b for k, (b, one) in enumerate(zip(branches, ends, strict=True)) if b and one.what == SHRINKS}
+    located = run_together([_hopf_at(branch, ends[k]) for k, branch in shrunk.items()])
+    for k, end in zip(shrunk, located, strict=True):
         ends[k] = end
     return ends
 
@@ -100,13 +101,13 @@ def _hopf_at(branch: Branch, cycle: End) -> Steps[End]:
     """Return the Hopf point at which cycles shrink to an equilibrium; their end itself if there is none nearby."""
     near = 0.05  # largest distance of the Hopf point from the last cycle [scale of the parameter]
     family = replace(branch.family, period=0)
+    away = near * family.scales[0]
     assert cycle.state is not None
     u = family.unknowns(cycle.state, [cycle.value])
     point = yield from first_point(problem_of(family), u, Settings())
     found = []
     for way in () if point is None else (opposite(point), point):
-        bounds = (cycle.value + sign * near * family.scales[0] for sign in (-1.0, 1.0))
-        half = yield from half_branch(family, way, *bounds, Settings())
+        half = yield from half_branch(family, way, cycle.value - away, cycle.value + away, Settings())
         found += [one for one in half.bifurcations if one.kind == HOPF]
     if not found:
         return cycle
