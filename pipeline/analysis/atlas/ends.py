@@ -267,7 +267,7 @@ def _beside(family: Family, u: np.ndarray, bounds: tuple[float, float]) -> Steps
         half = yield from half_branch(family, way, *bounds, TRACE, from_bifurcation=True)
         points = half.trace.points
         if len(points) > 2 and not n_unstable(points[1]):
-            passed = [replace(one, after=one.after - 1) for one in half.bifurcations]
+            passed = [replace(one, after=one.after - 1) for one in half.bifurcations if one.after]
             branch = Branch(family, points[1:], passed, ("start", half.trace.end))
             found.append((branch, bounds[int(branch.values[-1] > branch.values[0])]))
     return found
