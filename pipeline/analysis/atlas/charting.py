@@ -98,6 +98,16 @@ class Chart:
     curve_of: Array
     lost: dict[int, str]  # why a located bifurcation that was tried has no curve
 
+    def _take(self, curve: Followed) -> bool:
+        """Add a curve, unless points all along it lie on one that is known; return whether it was added."""
+        family, points = curve.family, curve.points
+        chosen = [points[int(share * (len(points) - 1))] for share in (0.1, 0.3, 0.5, 0.7, 0.9)]
+        ones = [Located(family, curve.kind, -1, family.state(p.u), np.asarray(family.values(p.u)), 0.0) for p in chosen]
+        alike = [c for c in self.curves if (c.kind, c.family.period) == (curve.kind, family.period)]
+        is_new = not any(all(_Track.of(c).holds(one) for one in ones) for c in alike)
+        self.curves += [curve] * is_new
+        return is_new
+
     def _settle(self, curves: Sequence[Followed]) -> None:
         """Find the bifurcations that lie on new curves."""
         first = len(self.curves) - len(curves)
@@ -133,8 +143,7 @@ class Chart:
                     tried[(*self.located[i].key, self.located[i].attractor)] = TRIES
                 continue
             found = continue_curves(starts, bounds, PLANE_CURVE, longest, generations, self.lost, self.curves)
-            self.curves += found
-            self._settle(found)
+            self._settle([curve for curve in found if self._take(curve)])
             for i in chosen:
                 key = (*self.located[i].key, self.located[i].attractor)
                 tried[key] = 0 if self.curve_of[i] >= 0 else tried.get(key, 0) + 1
