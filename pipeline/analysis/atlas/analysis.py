@@ -166,6 +166,8 @@ def atlas(run: OpenRun, options: AtlasOptions) -> xr.Dataset:
     others = [others_unstable(curve) for curve in chart.curves]
     crossed = crossings(plane, tracks, [one == 0 for one in others])
     _look_again(run, plane, changes, found, chart, crossed)
+    seen = [one for one in found if one.is_seen]
+    run.echo(f"atlas: {sum(one.is_explained for one in seen)} of {len(seen)} changes explained")
     lines = _lines(plane, changes, found)
     curves = curves_dataset(chart.curves, *plane.names, run.model)
     told = effects_of(plane, changes, found, chart.curves, crossed, [one == 0 for one in others])
