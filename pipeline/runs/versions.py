@@ -21,7 +21,15 @@ def version_of(name: str) -> str:
 
 
 def _parts(name: str) -> set[str]:
-    return {name}.union(*(_parts(other) for other in ANALYSES[name].builds_on))
+    """Return an analysis and all that it builds on; two may build on each other, each with other options."""
+    found: set[str] = set()
+    left = [name]
+    while left:
+        one = left.pop()
+        if one not in found:
+            found.add(one)
+            left += ANALYSES[one].builds_on
+    return found
 
 
 def current(run: RunDirectory, name: str, options: Mapping[str, Any]) -> dict[str, str]:
@@ -45,7 +53,7 @@ def current(run: RunDirectory, name: str, options: Mapping[str, Any]) -> dict[st
 
 def rests_on(name: str, chosen: str) -> bool:
     """Return whether an analysis takes the run's attractors, or branches, as they are."""
-    return any(one == chosen or rests_on(one, chosen) for one in ANALYSES[name].builds_on)
+    return chosen != name and chosen in _parts(name)
 
 
 def key_of(current: Mapping[str, str], analysis: Analysis, options: Options) -> dict[str, str]:

@@ -104,7 +104,7 @@ FURTHER = Analysis(
     whole="it runs points beside the run, whose cells are spread over all workers",
     columns=FURTHER_COLUMNS,
     settle=f"{_ROOM}:settle_plane",
-    builds_on=("attractors",),
+    builds_on=("attractors", "atlas", "identified"),
 )
 
 ORBIT_ENDS = Analysis(
@@ -117,7 +117,7 @@ ORBIT_ENDS = Analysis(
     rows="end",
     together=32,
     settle=f"{_ROOM}:settle_plane",
-    builds_on=("attractors",),
+    builds_on=("attractors", "further"),
 )
 
 SET_ENDS = Analysis(
@@ -129,7 +129,7 @@ SET_ENDS = Analysis(
     parts=f"{_ROOM}:windows",
     rows="end",
     settle=f"{_ROOM}:settle_plane",
-    builds_on=("attractors",),
+    builds_on=("attractors", "further"),
 )
 
 ATLAS_COLUMNS: Columns = (
