@@ -210,7 +210,7 @@ def _marker_of(kind: str) -> str:
 
 
 def _line_entries(ds: xr.Dataset) -> list[palette.Entry]:
-    kinds = sorted({*_kinds_of_lines(ds)} - {UNDECIDED})
+    kinds = sorted(set(_kinds_of_lines(ds)))
     return [
         Line2D([], [], marker=_marker_of(kind), label=f"{kind_text(kind)}, on no curve", **_LINE, **_MARK)
         for kind in kinds
@@ -218,12 +218,11 @@ def _line_entries(ds: xr.Dataset) -> list[palette.Entry]:
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset) -> None:
-    """Draw the lines whose ends have a name, with the marker of their kind in the middle; crosses mark the others."""
+    """Draw the lines, with the marker of their kind in the middle."""
     for number, kind in enumerate(_kinds_of_lines(ds)):
-        if kind != UNDECIDED:
-            places = line_places(ds, number)
-            look = {"marker": _marker_of(kind), **_LINE, **_MARK}
-            ax.plot(*places.T, markevery=[len(places) // 2], gid=f"line:{number}", zorder=4.5, **look)
+        places = line_places(ds, number)
+        look = {"marker": _marker_of(kind), **_LINE, **_MARK}
+        ax.plot(*places.T, markevery=[len(places) // 2], gid=f"line:{number}", zorder=4.5, **look)
 
 
 def _marks(ds: xr.Dataset) -> Iterator[_Marks]:

@@ -13,7 +13,6 @@ from pipeline.analysis.atlas.figure import region_tints
 from pipeline.analysis.atlas.sentences import member_text, members_of, region_text
 from pipeline.analysis.atlas.shapes import line_places, rings_of
 from pipeline.analysis.atlas.table import kind_text, open_changes, told_change
-from pipeline.analysis.events.kinds import UNDECIDED
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.own_words import axis_in_own_words, in_own_words, rate_of
 from pipeline.layout.vocabulary import axis_name
@@ -66,11 +65,8 @@ def _region(ds: xr.Dataset, number: int, rings: list[np.ndarray], tints: Mapping
 
 
 def _lines(ds: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """Yield the lines whose ends have a name; marks show the others."""
     for number, code in enumerate(ds["line_what"].values.tolist()):
-        kind = words_of(ds["line_what"])[code]
-        if kind != UNDECIDED:
-            yield {"kind": kind_text(kind), **_xy(line_places(ds, number))}
+        yield {"kind": kind_text(words_of(ds["line_what"])[code]), **_xy(line_places(ds, number))}
 
 
 def _marks(run: ExploredRun, found: xr.Dataset, ds: xr.Dataset, fixed: Mapping[str, int]) -> Iterator[dict[str, Any]]:

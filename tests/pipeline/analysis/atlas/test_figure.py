@@ -42,12 +42,11 @@ def made_up(labels=("1", "1 + 2"), thin=(0, 1), whats=("fold", "not_decided", "l
         "special_kind": ("special", np.array([0, 0], np.int8), code_flags(["cusp"])),
         "special_first": ("special", np.array([1.0, 2.05])),
         "special_second": ("special", np.array([0.25, 0.25])),
-        "line_what": ("line", np.array([WHATS.index(one) for one in ("boundary_crisis", "not_decided")], np.int8))
-        + (code_flags(WHATS),),
-        "line_period": ("line", np.array([0, 0])),
-        "line_size": ("line", np.array([2, 2])),
-        "line_first": (("line", "vertex"), np.array([[0.1, 0.2, np.nan], [0.1, 0.2, np.nan]])),
-        "line_second": (("line", "vertex"), np.array([[1.5, 1.7, np.nan], [1.0, 1.2, np.nan]])),
+        "line_what": ("line", np.array([WHATS.index("boundary_crisis")], np.int8), code_flags(WHATS)),
+        "line_period": ("line", np.array([0])),
+        "line_size": ("line", np.array([2])),
+        "line_first": (("line", "vertex"), np.array([[0.1, 0.2, np.nan]])),
+        "line_second": (("line", "vertex"), np.array([[1.5, 1.7, np.nan]])),
         "what": ("change", codes, code_flags(WHATS)),
         "change_set": ("change", np.ones(n, np.int8), code_flags(SETS)),
         "change_attractor": ("change", np.arange(n)),
@@ -102,7 +101,6 @@ def test_plot_atlas__what_is_drawn():
     assert list(patches) == ["region:0", "region:1", "thin:1"]
     assert patches["region:0"] == to_hex(style.tinted(style.PALETTE[0], 0.55))
     assert names == {"label:0": "1", "label:1": "1 + 2"}
-    # a line that nothing explains is shown by the crosses at its places
     assert lines == {"curve:0": 3, "line:0": 2, "not_explained": 1, "not_found": 1}
     assert [text.get_text() for text in ax.texts if not text.get_gid()] == ["CP"]
     assert legend_of(fig) == [
@@ -156,7 +154,7 @@ def test_geojson__shapes_are_those_of_the_atlas(tmp_path):
         geometry = shape(one["geometry"])
         assert geometry.is_valid
         by_what.setdefault(one["properties"]["what"], []).append((geometry, one["properties"]))
-    assert {what: len(own) for what, own in by_what.items()} == {"region": 2, "curve": 2, "line": 2, "not explained": 1}
+    assert {what: len(own) for what, own in by_what.items()} == {"region": 2, "curve": 2, "line": 1, "not explained": 1}
     (outer, about), (inner, _) = by_what["region"]
     assert (outer.area, inner.area) == (pytest.approx(3.0), pytest.approx(1.0))
     assert shapely.is_ccw(outer.exterior)

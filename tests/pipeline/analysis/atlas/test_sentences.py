@@ -22,7 +22,7 @@ def bordered(**given):
 
 def test_sentences__all_that_the_plane_contains():
     assert sentences(bordered()) == [
-        "The plane of amplitude (0 to 2 N m) and damping (0 to 2) has 2 regions, 1 curve of bifurcations and 2 lines "
+        "The plane of amplitude (0 to 2 N m) and damping (0 to 2) has 2 regions, 1 curve of bifurcations and 1 line "
         "of other ends of attractors.",
         "Region 0 covers 75 % of the plane, with 300 parameter points and 3000 cells. Met there: 1 attractor (fraction "
         "of these cells and its 95 % interval): A, periodic orbit of period 1: 1.000 (0.900 to 1.000).",
