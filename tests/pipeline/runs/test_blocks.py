@@ -204,7 +204,15 @@ PARTS = {
     "bands": {"parameter": "amplitude", "posterior": "posterior.nc"},
     "phase": {"phases": 16},
     "orbit_ends": {"parameter": "frequency_hz", "second": "amplitude"},
+    "set_ends": {"parameter": "a", "second": "b", "windows": 6},
 }
+BANDED = """
+kind = "sweep"
+model = "henon"
+axes = { a = { values = [1.0, 1.04, 1.08, 1.12, 1.16, 1.2, 1.24, 1.28] }, b = { values = [0.28, 0.3] } }
+initial_conditions = { kind = "random", n = 4, seed = 1, x = [-0.5, 0.5], y = [-0.2, 0.2] }
+integration = { n_transient = 500, n_keep = 100 }
+"""
 CYCLES = """
 kind = "sweep"
 model.name = "hopf"
@@ -230,7 +238,7 @@ def test_divided__parts_are_in_blocks_of_some(copy, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, one in ANALYSES.items() if one.parts])
 def test_in_blocks__every_analysis_of_parts(name, pairs, monkeypatch, tmp_path):
-    one, other = pairs({"bands": CHAOTIC_ROW, "phase": CYCLES}.get(name, CHAOTIC))
+    one, other = pairs({"bands": CHAOTIC_ROW, "phase": CYCLES, "set_ends": BANDED}.get(name, CHAOTIC))
     monkeypatch.chdir(tmp_path)
     draws = xr.Dataset({"value": (("draw", "parameter"), [[0.099], [0.1], [0.101]])}, {"parameter": ["damping"]})
     draws.assign_attrs(identified="damping").to_netcdf("posterior.nc", engine="scipy")
