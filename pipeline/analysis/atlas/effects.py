@@ -25,7 +25,7 @@ NOT_CROSSED = "its stable part passes between no two neighbouring points"
 
 @dataclass(frozen=True)
 class Effect:
-    """What a curve does: how many pairs of neighbouring points its stable part parts, and how many of them change."""
+    """Effect of a curve: the number of pairs of neighbouring points that it separates, and of those that change."""
 
     n_crossed: int
     n_effects: int

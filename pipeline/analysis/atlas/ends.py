@@ -46,7 +46,7 @@ WHAT = {"equilibrium": SHRINKS, "tangent": TOUCHES, "other_section": TOUCHES}
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """Where the stable part of a branch ends on the way to the neighbouring point."""
+    """End of the stable part of a branch, on the way to the neighbouring point."""
 
     what: str
     value: float = np.nan  # of the parameter along the way

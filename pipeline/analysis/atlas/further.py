@@ -104,8 +104,10 @@ def dataset_of(points: list[Wanted], results: list[xr.Dataset], states: Sequence
 
 
 def with_further(plane: Plane, ds: xr.Dataset, system: System) -> Plane:
-    """Return a plane with further points: the attractors at a node that has more starts now take the place of those
-    that were known there, and points between two neighbours part their edge.
+    """Return a plane with further points.
+
+    A node with more starts has the attractors that they found, and not those known before. A point between two
+    neighbours divides their edge.
 
     Sets at further points have ids of their own, unless they are orbits that were known at the node.
     """

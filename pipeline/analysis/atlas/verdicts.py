@@ -21,7 +21,7 @@ SAME_AT_POINT = 1e-4
 
 @dataclass(eq=False)
 class Verdict:
-    """What explains a change, and where it lies."""
+    """Explanation of a change, with its place."""
 
     what: str
     place: Array  # values of both parameters
