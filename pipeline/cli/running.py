@@ -153,6 +153,10 @@ def atlas(
     ],
     parameter: Annotated[str, typer.Option(help="First parameter, by default the run's first axis.")] = "",
     second: Annotated[str, typer.Option(help="Second parameter, by default the run's other axis.")] = "",
+    budget: Annotated[int, typer.Option(min=0, help="Most cells at further points, where the audit is worst.")] = 0,
+    windows: Annotated[
+        int | None, typer.Option(min=0, help="Places at which ends of chaotic sets and tori are named.")
+    ] = None,
     out: Annotated[str | None, typer.Option(help="Run directory of a specification; by default runs/NAME.")] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -179,7 +183,8 @@ def atlas(
             source, out, workers=workers, scheduler=scheduler, cluster=cluster, smoke=smoke, echo=console.note
         )
         directory = done.name
-    chosen: dict[str, Any] = {"parameter": parameter, "second": second}
+    chosen: dict[str, Any] = {"parameter": parameter, "second": second, "budget": budget}
+    chosen |= {} if windows is None else {"windows": windows}
     show(directory, "atlas", chosen, workers, where, csv, json)
     draw(directory, "atlas", FIGURES["atlas"].options(**chosen))
 

@@ -263,8 +263,10 @@ def _charted(
             low[axis] = max(low[axis], 0.5 * plane.low[axis])
     bounds = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
     chart = charted(located, bounds, options.curve_period)
-    for k, curve in zip(own, chart.curve_of.tolist(), strict=False):
+    for i, (k, curve) in enumerate(zip(own, chart.curve_of.tolist(), strict=False)):
         found[k].curve = curve
+        if curve < 0:
+            found[k].why = found[k].why or chart.lost.get(i, "")
     _agree(plane, changes, found)
     on_edge = {(changes[k].edge, found[k].what): found[k] for k in own if found[k].curve >= 0}
     for one, change in zip(found, changes, strict=True):  # a torus begins at the bifurcation that ends an orbit

@@ -208,9 +208,3 @@ def _others(kind: str, point: Any) -> int:
     else:
         critical = np.argsort(np.abs(ordered - (-1.0 if kind == DOUBLING else 1.0)), kind="stable")[:1]
     return int((np.abs(np.delete(ordered, critical)) > 1.0).sum())
-
-
-def scales_of(bounds: Bounds) -> tuple[float, float]:
-    """Return the lengths of the ranges of both parameters."""
-    (low, high), (second_low, second_high) = bounds
-    return high - low, second_high - second_low

@@ -86,7 +86,6 @@ def of_lines(lines: Sequence[Line]) -> dict[str, Any]:
         "line_what": ("line", np.array([WHATS.index(line.what) for line in lines], np.int8), code_flags(WHATS)),
         "line_period": ("line", np.array([line.period for line in lines], np.int32)),
         "line_size": ("line", np.array([len(line.places) for line in lines], np.int32)),
-        "n_tested": ("line", np.array([len(line.places) for line in lines], np.int32)),
         "line_first": (("line", "vertex"), places[..., 0]),
         "line_second": (("line", "vertex"), places[..., 1]),
     }

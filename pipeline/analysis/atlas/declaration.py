@@ -149,7 +149,7 @@ ATLAS_COLUMNS: Columns = (
         index_verdict="whether the indices of the orbits add up to what they must",
     ),
     *over("line", line_what="what lies on the line", line_period="period of the orbit, 0 none"),
-    *over("line", line_size="points of the line", n_tested="places at which it was named"),
+    *over("line", line_size="points of the line"),
     *_plane("line", "line vertex", "point of the line"),
     *over(
         "change",

@@ -68,6 +68,8 @@ def wanted(plane: Plane, ds: xr.Dataset, region: Array, budget: int) -> list[Wan
         if len(nodes):
             away = np.linalg.norm(plane.scaled(plane.values[nodes]) - plane.scaled(labels[number]), axis=1)
             node = int(nodes[away.argmin()])
+            if plane.n_cells[node] > n:  # more starts settled too few of the cells
+                continue
             values = tuple(plane.values[node].tolist())
             found[values] = Wanted(values, SEEN - cells + int(plane.n_cells[node]), node)
         else:
@@ -130,7 +132,7 @@ def with_further(plane: Plane, ds: xr.Dataset, system: System) -> Plane:
             parted.append(False)
         parted[edge] = True
     kept = ~np.isin(plane.node, at[at >= 0])
-    points = np.split(ds["further_section"].values, np.cumsum(ds["set_points"].values)[:-1])
+    points = np.split(ds["further_section"].values, np.cumsum(ds["set_points"].values))[:-1]
     node = node_of[ds["of_point"].values]
     numbers = _numbers(plane, node, points, ds["set_kind"].values, system)
 

@@ -15,12 +15,12 @@ from pipeline.analysis.events.kinds import LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.events.windows import events_within
 from pipeline.layout.vocabulary import APERIODIC, parameter_name
 from pipeline.results.ragged import isel
-from pipeline.results.tabular import counted, words_of
+from pipeline.results.tabular import words_of
 
 BESIDE = 1
 """Points of a window beyond the two between which a set ends, on each side."""
 
-NO_WINDOW = "a set that is no orbit; it was named at no place of its line (--windows)"
+NO_WINDOW = "a set that is no orbit; it lies between no two places at which its line was looked at (--windows)"
 
 
 def set_lines(plane: Plane, changes: Sequence[Change]) -> list[Line]:
@@ -84,10 +84,11 @@ def carried(lines: Sequence[Line], found: Sequence[Verdict], tested: Sequence[in
             whats = {found[line.items[p]].what for p in beside}
             one = found[k]
             one.what, one.why = UNDECIDED, NO_WINDOW
-            if len(whats) == 1 and len(beside) == min(2, len(places)):
-                one.what = whats.pop()
-                one.why = f"as at {counted(len(beside), 'neighbouring place')} of its line, where it was named"
-                if one.what == UNDECIDED:
-                    one.why = f"at {counted(len(beside), 'neighbouring place')} of its line it was not decided"
-            elif len(whats) > 1:
-                one.why = f"the neighbouring places of its line were named differently: {', '.join(sorted(whats))}"
+            if len(beside) < 2:
+                continue
+            if len(whats) > 1:
+                one.why = f"the places of its line on both sides were named differently: {', '.join(sorted(whats))}"
+            elif (what := whats.pop()) == UNDECIDED:
+                one.why = "at the places of its line on both sides it was not decided"
+            else:
+                one.what, one.why = what, "as at the places of its line on both sides, where it was named"

@@ -1,5 +1,6 @@
 """The parts of the audit of a plane, on planes made by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -188,6 +189,8 @@ def test_windows__names_are_carried_between_places_that_agree():
 
     assert told(CASCADE, CASCADE, CASCADE) == [CASCADE] * 9
     assert told(CASCADE, CASCADE, UNDECIDED) == [CASCADE] * 5 + [UNDECIDED] * 4
+    tested = tested[:1]  # one place alone names no other
+    assert told(CASCADE) == [CASCADE] + [UNDECIDED] * 8
 
 
 def further_of(plane, points, sets):
@@ -207,7 +210,10 @@ def further_of(plane, points, sets):
                     "is_polished": ("set", np.ones(len(own), bool)),
                     "n_points": ("set", n_points),
                     "n_sets": ((), len(own)),
-                    "attractor_points": (("sample", "state"), np.concatenate([np.array(s[3]) for s in own])[:, None]),
+                    "attractor_points": (
+                        ("sample", "state"),
+                        np.concatenate([np.zeros(0), *(np.array(s[3]) for s in own)])[:, None],
+                    ),
                     "attractor_id": ("initial_condition", np.zeros(one.n_starts, int)),
                     "decision": ("initial_condition", np.zeros(one.n_starts, int)),
                     "status": ("initial_condition", np.ones(one.n_starts, int)),
@@ -263,3 +269,12 @@ def test_wanted__unexplained_orbits_first_then_thin_regions_within_the_budget():
     assert found == [Wanted((0.25, 0.5), 10, edge=(1, 4)), Wanted((1.0, 1.0), 289, 8)]
     assert wanted(plane, ds, region, 100) == found[:1]
     assert wanted(plane, ds, region, 5) == []
+    told = replace(plane, n_cells=np.where(np.arange(9) == 8, 289, plane.n_cells))
+    assert wanted(told, ds, region, 1000) == found[:1]  # the thin region had its starts
+
+
+def test_further_points__without_an_attractor_have_cells_alone():
+    plane = plane_with((2, 2), orbits((2, 2), lambda a, b: [0.1 * a]))
+    more = with_further(plane, further_of(plane, [Wanted((0.5, 0.0), 10, edge=(0, 2))], []), SYSTEM)
+    assert (len(more.values), len(more.node), len(more.points)) == (5, 4, 4)
+    assert [(one.here, one.there) for one in changes_of(more, SYSTEM) if 4 in (one.here, one.there)] == [(0, 4), (2, 4)]
