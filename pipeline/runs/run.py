@@ -253,11 +253,13 @@ def _complete(opened: Sequence[_Opened], workers: int | None, where: Where, echo
     """Compute all tasks of some runs that are not committed."""
     from pipeline.compute import clients, execute
 
+    # also of complete runs: a stop may have come between the last task and the packing of its block
+    packed = [(run, Packer(run.info, run.commits)) for run in opened]
     for run in opened:
         if not run.missing:
             write_copy(run.info, run.commits)
             echo(f"{run.info.name} is complete; nothing to do.")
-    runs = [run for run in opened if run.missing]
+    runs, packers = [run for run in opened if run.missing], [packer for run, packer in packed if run.missing]
     if not runs:
         return
     for run in runs:
@@ -271,7 +273,7 @@ def _complete(opened: Sequence[_Opened], workers: int | None, where: Where, echo
     clients.reach(where)
     for run in runs:
         _compile(run.plan, echo)
-    tasks, packers = _Tasks(runs), [Packer(run.info, run.commits) for run in runs]
+    tasks = _Tasks(runs)
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(tasks.missing)))
     expected_s = sum(run.plan.core_seconds * run.n_left / run.plan.n_cells for run in runs) / cores

@@ -313,7 +313,7 @@ def _borders(drawing: _Drawing, ends: np.ndarray, regions: np.ndarray, line: np.
 
 
 def _dangling(drawing: _Drawing, ends: np.ndarray, line: np.ndarray) -> tuple[int, ...]:
-    """Return the lines of these segments, which bound nothing, if they are longer than a line may pass another."""
+    """Return the lines with segments that bound no region and are longer than a line may run past another."""
     import shapely
 
     order = np.argsort(line, kind="stable")

@@ -165,7 +165,7 @@ class Chart:
 
 
 def charted(located: Sequence[Located], bounds: Bounds, longest: int, generations: int = 1) -> Chart:
-    """Continue bifurcations as curves in the plane, each curve once, with those that spring from points on them.
+    """Continue bifurcations as curves in the plane, and the curves that start at points of codimension two on them.
 
     Parameters
     ----------

@@ -25,7 +25,9 @@ NOT_CROSSED = "its stable part passes between no two neighbouring points"
 
 @dataclass(frozen=True)
 class Effect:
-    """Effect of a curve: the number of pairs of neighbouring points that it separates, and of those that change."""
+    """Number of pairs of neighbouring points that a curve separates, of those whose attractors differ, and why others
+    do not.
+    """
 
     n_crossed: int
     n_effects: int

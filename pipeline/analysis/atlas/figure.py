@@ -141,7 +141,7 @@ def _region_entries(ds: xr.Dataset, tints: dict[str, Any]) -> list[palette.Entry
 
 
 def _is_hatched(ds: xr.Dataset) -> Array:
-    """Return which regions are hatched: those of which few cells are known, unless all are so."""
+    """Return which regions are hatched: those with fewer than 299 known cells, unless all have so few."""
     thin = ds["is_thin"].values == 1
     return np.asarray(thin & ~thin.all())
 
