@@ -9,10 +9,11 @@ from typing import Any
 from magpend_core.engine import simd, vecmath
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
+from magpend_core.expressions.writer import SIMD
 from magpend_core.models.text import runtime
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.derive import Derived
-from magpend_core.models.text.generate import SIMD, Source
+from magpend_core.models.text.generate import Source
 from magpend_core.models.text.layers import FADING
 
 _MODULE = __name__  # a module that later processes find, as the compile cache must

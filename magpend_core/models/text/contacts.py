@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from magpend_core.models.text.derivatives import derivatives
-from magpend_core.models.text.graph import Graph, GraphError, Node, in_order, substituted
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import Graph, GraphError, Node, in_order, substituted
 
 
 @dataclass(frozen=True)

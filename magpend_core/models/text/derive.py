@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import CONSTANT, STATED, TIMED, Graph, Node, in_order
 from magpend_core.models.parameters import POSITIVE
 from magpend_core.models.text.contacts import Jump, along, with_contacts
 from magpend_core.models.text.definition import Definition
-from magpend_core.models.text.derivatives import derivatives
 from magpend_core.models.text.grammar import TIMED as TIMED_NAMES
 from magpend_core.models.text.grammar import Tree
-from magpend_core.models.text.graph import CONSTANT, STATED, TIMED, Graph, Node, in_order
 from magpend_core.models.text.layers import GENERIC, Steep, core_of, place_of, steep_places
 from magpend_core.models.text.numeric import node_values
 from magpend_core.models.text.sliding import Sliding, sliding_of

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.expressions.graph import Node
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.domains import readable
-from magpend_core.models.text.graph import Node
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import node_values
 

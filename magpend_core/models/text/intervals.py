@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import Graph, Node, in_order
 from magpend_core.models.text.definition import Definition
-from magpend_core.models.text.derivatives import derivatives
 from magpend_core.models.text.derive import Builder
-from magpend_core.models.text.graph import Graph, Node, in_order
 
 Interval = tuple[np.ndarray, np.ndarray]
 """Least and greatest values, arrays of one shape."""

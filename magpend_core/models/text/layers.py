@@ -15,8 +15,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from magpend_core.models.text.derivatives import derivatives
-from magpend_core.models.text.graph import CONSTANT, TIMED, Graph, GraphError, Node, in_order, substituted
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import CONSTANT, TIMED, Graph, GraphError, Node, in_order, substituted
 
 FADING = ("tanh", "1/(1 + exp)")
 """Forms that fall off exponentially."""

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from magpend_core.expressions.graph import GraphError
 from magpend_core.models.model import Model, ModelError
 from magpend_core.models.text.circles import angle_remark, undeclared_angles
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.derive import Derived, derive
 from magpend_core.models.text.generate import Source, source_of
-from magpend_core.models.text.graph import GraphError
 from magpend_core.models.text.scene import classifier_of, drawing_of
 from magpend_core.versions import IMPACTS, TEXT, written
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.expressions.graph import Node, in_order
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.grammar import Tree
-from magpend_core.models.text.graph import Node, in_order
 
 
 def _square(phase: Any, duty: Any) -> Any:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from magpend_core.models.text.derivatives import derivatives
-from magpend_core.models.text.graph import STATED, Graph, Node, in_order, made_again, substituted
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import STATED, Graph, Node, in_order, made_again, substituted
 from magpend_core.models.text.switching import Switch
 
 _NO_DIFFERENCE = 1e-300

@@ -12,8 +12,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from magpend_core.models.text.derivatives import derivatives
-from magpend_core.models.text.graph import (
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import (
     CONSTANT,
     STATED,
     TIMED,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from magpend_core.models.text.graph import Graph, Node, in_order
+from magpend_core.expressions.graph import Graph, Node, in_order
 
 
 def derivatives(graph: Graph, roots: tuple[Node, ...], seeds: Mapping[Node, Node]) -> list[Node]:
