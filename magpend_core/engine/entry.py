@@ -141,8 +141,8 @@ def integrate(
     rtol, atol = check_tolerances(rtol, atol)
     rtol = rtol_of_motion(system, rtol)
     watched = check_quantities(quantities, system)
-    if watched and system.method != "dopri5":
-        raise ValueError(f"quantities are watched with method dopri5 alone; it is {system.method!r}.")
+    if watched and not system.tableau.is_continuous:
+        raise ValueError(f"quantities are not watched with method {system.method!r}; choose dopri5 or rodas5p.")
     attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
     n_lanes = check_count("n_lanes", n_lanes, 1)
     frequency = check_frequency(frequency_hz, 2)

@@ -1,6 +1,6 @@
 """Integrate many trajectories at once in SIMD lanes, each with its own time, step size and parameters.
 
-The methods are those of Dormand and Prince, of order 5 or 8, with error control. Every trajectory has a lane;
+The methods are those of Dormand and Prince, of order 5 or 8, and a Rosenbrock method of order 5, with error control. Every trajectory has a lane;
 `simd.WIDTH` lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). Each pass attempts
 one step in all groups; a step is accepted or rejected lane by lane, by `where_less` and not by a branch. Then a
 short scalar pass serves the lanes in which something happened: the end of a time segment between two forcing
@@ -32,13 +32,14 @@ import numpy as np
 
 from magpend_core.engine import events as event_templates
 from magpend_core.engine import modes as mode_templates
-from magpend_core.engine import observers
+from magpend_core.engine import observers, rosenbrock
 from magpend_core.engine import tangents as tangent_templates
 from magpend_core.engine.digests import code_length
 from magpend_core.engine.events import LANDED, TAKE_BACK, event_bindings
 from magpend_core.engine.jit import bound_part, entry, inline, keeping
 from magpend_core.engine.modes import CHATTERED, mode_bindings
 from magpend_core.engine.observers import Observer
+from magpend_core.engine.rosenbrock import implicit_bindings, implicit_rows
 from magpend_core.engine.simd import (
     WIDTH,
     absolute,
@@ -139,6 +140,11 @@ class Rows(NamedTuple):
     resolution: int  # s, of the event's instant; 0 if no event is being located
     level: int  # of the section
     entries: int  # Jacobian entries at each stage but the first, if the engine integrates the tangent vectors
+    derivatives: int  # of the rates, by states and by time; this and the next four of an implicit method only
+    matrix: int
+    exchanges: int  # 1 where two of its rows were exchanged
+    right: int  # right-hand side of the linear system
+    drift: int  # change of the rates in time during the step
     constants: int  # last, and padded to a multiple of four: more systems then agree in all other offsets
     size: int
 
@@ -158,6 +164,7 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
         *[n] * 3,
         *[1 if n else 0] * 4,
         (system.tableau.n_stages - 1) * n_entries(system),
+        *implicit_rows(system),
         -(-(system.n_constants + system.n_modes) // 4) * 4,
     ]
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
@@ -913,6 +920,9 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "ERROR": system.tableau.error,
         "OTHER_ERROR": system.tableau.other_error,
         "ORDER": float(system.tableau.order),
+        "DENSE": system.tableau.dense,
+        "MIDDLE": system.tableau.middle,
+        "FIRST_WEIGHED": 2 - system.is_stiff,
         **event_bindings(system),
         **mode_bindings(system),
         "NE": system.n_edges,
@@ -932,6 +942,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "memory_size": observer.memory_size,
         **observer.bindings,
         **tangent_bindings(system),
+        **implicit_bindings(system),
     }
     lengths = code_length(system.rhs) + code_length(system.forcing)
     short = lengths <= UNROLLED_LENGTH and not bindings["CARRIES"]
@@ -943,7 +954,11 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
     for module in (event_templates, mode_templates):
         templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
     templates |= {key: globals()[key] for key in (*_INLINE, *_CALLED)}
-    if bindings["CARRIES"]:
+    if system.is_stiff:
+        own = (*rosenbrock.INLINE, *rosenbrock.CALLED)
+        templates = {key: getattr(rosenbrock, key) for key in own} | templates
+        templates["run_stages"] = rosenbrock.run_stages_implicit
+    elif bindings["CARRIES"]:
         own = (*tangent_templates.INLINE, *tangent_templates.CALLED)
         templates = {key: getattr(tangent_templates, key) for key in own} | templates
         templates["run_stages"] = tangent_templates.run_stages_and_vectors
@@ -953,7 +968,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         templates["attempt"] = iterate
     if system.tableau.has_two_errors:
         templates["squared_error"] = squared_error_of_two
-    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE, *_INLINE}
+    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE, *rosenbrock.INLINE, *_INLINE}
     for key, template in templates.items():
         bindings[key] = bound_part(template, bindings, key in dissolving)
     return bindings

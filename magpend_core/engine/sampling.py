@@ -38,7 +38,6 @@ from magpend_core.engine.modes import CHATTERED
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, load, store, take
 from magpend_core.engine.system import System
-from magpend_core.engine.tableau import DENSE, N_STAGES
 from magpend_core.engine.threads import share
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.status import Status
@@ -263,7 +262,7 @@ def seats_for(system: System, samples: Samples, n_lanes: int, queue: np.ndarray)
         turns=np.zeros((size, n), np.int64),
         edge_table=np.zeros((size, 3, max(system.n_edges, 1))),
         p=np.zeros(samples.parameters.shape[1]),
-        weights=np.zeros(N_STAGES),
+        weights=np.zeros(system.tableau.n_stages),
         scratch=np.zeros(max(system.n_constants + system.n_modes, n)),
         events=np.zeros(n_groups, np.int64),
         n_watching=np.zeros(n_groups, np.int64),
@@ -314,7 +313,8 @@ _CALLED = ("begin_interval", "begin_trajectory", "write_due", "go_on", "end_traj
 @cache
 def sampler_of(system: System) -> Callable[..., None]:
     """Compile the sampling loop `follow_all` for a system."""
-    system = replace(system, method="dopri5")
+    if not system.tableau.is_continuous:
+        system = replace(system, method="dopri5")
     bindings = engine_bindings(system, RECORD)
     for key in (*_INLINE, *_CALLED):
         bindings[key] = bound_part(globals()[key], bindings, key in _INLINE)

@@ -177,8 +177,8 @@ class System:
         A drive period is one iteration, without steps, tolerances and method; nothing depends on time.
     method : str
         Key of `tableau.METHODS`: ``"dopri5"`` of order 5, or ``"dop853"`` of order 8, which needs a half or a quarter
-        of the time for smooth equations at tolerances below 1e-6, but gains nothing if layers limit the steps. Only
-        ``"dopri5"`` can track quantities and sample trajectories.
+        of the time for smooth equations at tolerances below 1e-6, but gains nothing if layers limit the steps, and
+        can neither track quantities nor sample trajectories; ``"rodas5p"``, implicit of order 5, is for stiff systems.
     tangents_of : System or None
         The original system, if this one has tangent vectors added (see `variational.with_tangents`).
     recorded_for : System or None
@@ -351,6 +351,11 @@ class System:
             known = ", ".join(METHODS)
             raise ValueError(f"method = {self.method!r}: {self.name} can be integrated by {known}.")
         return METHODS[self.method]
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether the system is integrated by an implicit method, which solves linear systems with the Jacobian."""
+        return self.tableau.implicit is not None
 
     @property
     def n_events(self) -> int:

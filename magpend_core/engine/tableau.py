@@ -1,4 +1,8 @@
-"""Runge-Kutta methods of Dormand and Prince: of order 5, with its continuous extension, and of order 8."""
+"""Coefficients of the integration methods.
+
+Explicit Runge-Kutta methods are those of Dormand and Prince: of order 5, with its continuous extension, and of order 8.
+For stiff systems there is Steinebach's Rosenbrock method of order 5.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +41,9 @@ DENSE = np.array(
     ]
 )
 
-MIDDLE = DENSE @ 0.5 ** np.arange(1.0, 5.0)
-"""Weights of the slopes at the middle of a step."""
-
 
 class Tableau(NamedTuple):
-    """Coefficients of an explicit Runge-Kutta method whose last stage is the new state (first same as last).
+    """Coefficients of a method whose last stage is the new state (first same as last).
 
     Attributes
     ----------
@@ -55,6 +56,11 @@ class Tableau(NamedTuple):
         In a second estimate, of lower order; zeros for none.
     order : int
         Of the estimate that steps are chosen by.
+    dense : ndarray, (n_stages, 4)
+        The continuous extension is y(t + x h) = y + h sum_i k_i P_i(x) with P_i(x) = sum_j dense[i, j] x^(j + 1) and the
+        slopes k_i; zeros for none.
+    implicit : Implicit or None
+        What a Rosenbrock method has besides. Its slopes between the first and the last are solutions of linear systems.
     """
 
     nodes: np.ndarray
@@ -62,6 +68,8 @@ class Tableau(NamedTuple):
     error: np.ndarray
     other_error: np.ndarray
     order: int
+    dense: np.ndarray
+    implicit: Implicit | None = None
 
     @property
     def n_stages(self) -> int:
@@ -72,6 +80,35 @@ class Tableau(NamedTuple):
     def has_two_errors(self) -> bool:
         """Whether the method combines error estimates of two orders."""
         return bool(self.other_error.any())
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the method has a continuous extension."""
+        return bool(self.dense.any())
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Weights of the slopes at the middle of a step, shape (n_stages,)."""
+        return np.asarray(self.dense @ 0.5 ** np.arange(1.0, 5.0))
+
+
+class Implicit(NamedTuple):
+    """Coefficients of a Rosenbrock method, in the form without products of the Jacobian J and vectors.
+
+    With the rates f(t, y) and their derivative T by time, slope k_i of stage i is the solution of
+
+        (1/(gamma h) - J) h k_i = f(t + nodes_i h, y + h sum_j stages_ij k_j) + sum_j couplings_ij k_j + h shifts_i T.
+
+    Attributes
+    ----------
+    gamma : float
+    couplings : ndarray, (n_stages, n_stages)
+    shifts : ndarray, (n_stages,)
+    """
+
+    gamma: float
+    couplings: np.ndarray
+    shifts: np.ndarray
 
 
 def _filled(rows: Sequence[Mapping[int, float]], n: int) -> np.ndarray:
@@ -185,11 +222,117 @@ _ERROR_3: dict[int, float] = {
 
 _ERRORS_8 = _filled([_ERROR_5, _ERROR_3], 13)
 
+# Steinebach's Rodas5P, of order 5, stiffly accurate and L-stable: G. Steinebach, BIT Numer. Math. 63 (2023) 27, with the
+# coefficients of OrdinaryDiffEq.jl (MIT licence) to all digits. Stages there are numbered from 1; slope 0 here is the
+# rate at the step's begin, and slope 9 that at its end.
+_GAMMA = 0.21193756319429014
+_NODES_P = [0.0, 0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0, 1.0]
+_LAST_P = [-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946]
+_STAGES_P = [
+    [],
+    [],
+    [3.0],
+    [2.849394379747939, 0.45842242204463923],
+    [-6.954028509809101, 2.489845061869568, -10.358996098473584],
+    [2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641],
+    _LAST_P,
+    [*_LAST_P, 1.0],
+    [*_LAST_P, 1.0, 1.0],
+    [*_LAST_P, 1.0, 1.0, 1.0],
+]
+_COUPLINGS_P = [
+    [],
+    [],
+    [-14.155112264123755],
+    [-17.97296035885952, -2.859693295451294],
+    [147.12150275711716, -1.41221402718213, 71.68940251302358],
+    [165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306],
+    [24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471],
+    [
+        30.91273214028599,
+        -3.1208243349937974,
+        77.79954646070892,
+        34.28646028294783,
+        -19.097331116725623,
+        -28.087943162872662,
+    ],
+    [
+        37.80277123390563,
+        -3.2571969029072276,
+        112.26918849496327,
+        66.9347231244047,
+        -40.06618937091002,
+        -54.66780262877968,
+        -9.48861652309627,
+    ],
+    [],
+]
+_SHIFTS_P = [
+    0.0,
+    0.21193756319429014,
+    -0.42387512638858027,
+    -0.3384627126235924,
+    1.8046452872882734,
+    2.325825639765069,
+    *[0.0] * 4,
+]
+# of x (1 - x) times 1, x and x^2 in the continuous extension, of order 4
+_BENDS_P = [
+    [
+        25.948786856663858,
+        -2.5579724845846235,
+        10.433815404888879,
+        -2.3679251022685204,
+        0.524948541321073,
+        1.1241088310450404,
+        0.4272876194431874,
+        -0.17202221070155493,
+    ],
+    [
+        -9.91568850695171,
+        -0.9689944594115154,
+        3.0438037242978453,
+        -24.495224566215796,
+        20.176138334709044,
+        15.98066361424651,
+        -6.789040303419874,
+        -6.710236069923372,
+    ],
+    [
+        11.419903575922262,
+        2.8879645146136994,
+        72.92137995996029,
+        80.12511834622643,
+        -52.072871366152654,
+        -59.78993625266729,
+        -0.15582684282751913,
+        4.883087185713722,
+    ],
+]
+
+
+def _shifted(rows: Sequence[Sequence[float]], n: int) -> np.ndarray:
+    """Return rows of coefficients of the slopes 1, 2, ... as a matrix with n columns."""
+    return _filled([{1 + j: value for j, value in enumerate(row)} for row in rows], n)
+
+
+def _rodas5p() -> Tableau:
+    n = len(_NODES_P)
+    stages = _shifted(_STAGES_P, n - 1)
+    error = np.zeros(n)
+    error[8] = 1.0
+    a, b, c = _shifted(_BENDS_P, n)
+    dense = np.stack([np.append(stages[-1], 0.0) + a, b - a, c - b, -c], axis=1)
+    implicit = Implicit(_GAMMA, _shifted(_COUPLINGS_P, n), np.array(_SHIFTS_P))
+    return Tableau(np.array(_NODES_P), stages, error, np.zeros(n), 5, dense, implicit)
+
+
 METHODS = {
-    "dopri5": Tableau(NODES, STAGES, ERROR, np.zeros(N_STAGES), 5),
-    "dop853": Tableau(np.array(_NODES_8), _filled(_STAGES_8, 12), _ERRORS_8[0], _ERRORS_8[1], 8),
+    "dopri5": Tableau(NODES, STAGES, ERROR, np.zeros(N_STAGES), 5, DENSE),
+    "dop853": Tableau(np.array(_NODES_8), _filled(_STAGES_8, 12), _ERRORS_8[0], _ERRORS_8[1], 8, np.zeros((13, 4))),
+    "rodas5p": _rodas5p(),
 }
 """Methods by name, as given by their authors."""
 
-ITERATION = Tableau(np.zeros(2), np.zeros((2, 1)), np.zeros(2), np.zeros(2), 1)
+ITERATION = Tableau(np.zeros(2), np.zeros((2, 1)), np.zeros(2), np.zeros(2), 1, np.zeros((2, 4)))
 """What stands for a method in a system that is a map: its one stage after the first evaluates the map at the state."""

@@ -31,7 +31,6 @@ from magpend_core.engine.simd import (
     where_less,
 )
 from magpend_core.engine.system import System
-from magpend_core.engine.tableau import MIDDLE
 
 LOWEST, HIGHEST, MEAN = 0, 1, 2
 """Entries of the last dim of `Cells.watched`."""
@@ -63,7 +62,7 @@ def evaluate_watched(w: Any, base: int) -> None:
     for i in range(N):
         row = base + i * WIDTH
         total = MIDDLE[0] * load(w, row + ROWS.slopes)
-        for s in range(2, N_STAGES):
+        for s in range(FIRST_WEIGHED, N_STAGES):
             total = multiply_add(MIDDLE[s], load(w, row + ROWS.slopes + s * N * WIDTH), total)
         store(w, row + ROWS.halfway, load(w, row + ROWS.state) + h * total)
     c = load_rows(w, base + ROWS.constants, NC)

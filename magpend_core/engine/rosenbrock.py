@@ -1,0 +1,246 @@
+"""Step with a Rosenbrock method, for stiff systems: linear systems with the Jacobian take the place of explicit stages.
+
+These functions are templates for the engine, see `lanes`; `run_stages_implicit` takes the place of `run_stages`. A step
+of length h factorises the matrix I - gamma h J once, by elimination with partial pivoting, and solves for the slope of
+each stage with it (see `tableau.Implicit`). The rows of a lane group are the same at each step; where a lane needs an
+exchange of rows it is made by `where_less`. Elements outside the band of the Jacobian are left out, with the states
+in an order that makes the band narrow (reverse Cuthill and McKee).
+
+Tangent vectors are stepped by the derivative of this scheme. For a vector v that is a slope with the same matrix, and
+with the change of J along v times the slope of the states on the right-hand side.
+
+The first slope is the rate at the step's begin, the last that at its end, as in the explicit methods: so events, layers
+and dense output are the same for both.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from magpend_core.engine.simd import (
+    WIDTH,
+    absolute,
+    any_nonzero,
+    load,
+    load_rows,
+    multiply_add,
+    store,
+    store_rows,
+    where_less,
+)
+from magpend_core.engine.symbolic import linearised
+from magpend_core.engine.system import System
+
+
+def order_of_states(entries: list[tuple[int, int]], n: int) -> np.ndarray:
+    """Return the position of each state in the linear systems, shape (n,), from the Jacobian's (row, column) pairs."""
+    rows, columns = np.array(entries or [(0, 0)]).T
+    pattern = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)).tocsr()
+    position = np.empty(n, np.int64)
+    position[reverse_cuthill_mckee(pattern + pattern.T, symmetric_mode=True)] = np.arange(n)
+
+    def band(at: np.ndarray) -> int:
+        return int(np.abs(at[rows] - at[columns]).max())
+
+    same = np.arange(n)
+    return position if band(position) < band(same) else same
+
+
+def implicit_rows(system: System) -> list[int]:
+    """Return the numbers of rows of the work array that the method needs; zeros for an explicit method.
+
+    They are those of the derivatives, the matrix, its exchanges, the right-hand side, and the rates' change in time.
+    """
+    if system.tableau.implicit is None:
+        return [0] * 5
+    n, of = (system.tangents_of or system).n_states, linearised(system)
+    return [len(of.entries) + len(of.timed), n * n, n * n, n, system.n_states if of.timed else 0]
+
+
+def implicit_bindings(system: System) -> dict[str, Any]:
+    """Return the values of this module's free global names (such as ``GAMMA``) for a system."""
+    implicit = system.tableau.implicit
+    if implicit is None:
+        return {}
+    n, of = (system.tangents_of or system).n_states, linearised(system)
+    own = [(i, j) for i, j in of.entries if i < n]
+    at = order_of_states(own, n)
+    offsets = [int(at[i] - at[j]) for i, j in own]
+    cross = of.entries[len(own) :]
+    starts = np.searchsorted([i for i, _ in cross], np.arange(n, system.n_states + 1))
+    return {
+        "GAMMA": implicit.gamma,
+        "COUPLINGS": implicit.couplings,
+        "SHIFTS": implicit.shifts,
+        "linearise": of.function,
+        "N_SOLVED": n,
+        "N_OWN_ENTRIES": len(own),
+        "N_ALL_ENTRIES": len(of.entries),
+        "N_TIMED": len(of.timed),
+        "IS_TIMED": bool(of.timed),
+        "HAS_CROSS": len(cross) > 0,
+        "POSITIONS": at,
+        "PLACES": np.array([at[i] * n + at[j] for i, j in own] or [0]),
+        "BELOW": max(0, *offsets),
+        "BEHIND": max(0, *offsets) - min(0, *offsets),
+        "TIMED": np.array(of.timed or (0,)),
+        "CROSS_STARTS": starts,
+        "CROSS_COLUMNS": np.array([j for _, j in cross] or [0]),
+    }
+
+
+def fill_matrix(w: Any, base: int) -> None:
+    """Compute the derivatives of the rates at the begin of a step, and the matrix I - gamma h J."""
+    h = load(w, base + ROWS.step)
+    y = load_rows(w, base + ROWS.state, N_KNOWN)
+    c = load_rows(w, base + ROWS.constants, NC)
+    store_rows(w, base + ROWS.derivatives, linearise(y, load(w, base + ROWS.time), c))
+    for k in range(N_SOLVED * N_SOLVED):
+        store(w, base + ROWS.matrix + k * WIDTH, 0.0 * h)
+    for i in range(N_SOLVED):
+        store(w, base + ROWS.matrix + i * (N_SOLVED + 1) * WIDTH, 0.0 * h + 1.0)
+    for k in range(N_OWN_ENTRIES):
+        at = base + ROWS.matrix + PLACES[k] * WIDTH
+        entry = load(w, base + ROWS.derivatives + k * WIDTH)
+        store(w, at, load(w, at) - (GAMMA * h) * entry)
+    if IS_TIMED:
+        first = base + ROWS.derivatives + N_ALL_ENTRIES * WIDTH
+        for i in range(N):
+            store(w, base + ROWS.drift + i * WIDTH, 0.0 * h)
+        for k in range(N_TIMED):
+            store(w, base + ROWS.drift + TIMED[k] * WIDTH, h * load(w, first + k * WIDTH))
+
+
+def exchange(w: Any, base: int, j: int, i: int, end: int) -> None:
+    """Exchange rows `i` and `j` of the matrix, from column `j` to `end`, in the lanes in which row `i` has the larger
+    pivot.
+    """
+    row, other = base + ROWS.matrix + j * N_SOLVED * WIDTH, base + ROWS.matrix + i * N_SOLVED * WIDTH
+    pivot, candidate = load(w, row + j * WIDTH), load(w, other + j * WIDTH)
+    swap = where_less(absolute(pivot), absolute(candidate), 1.0, 0.0)
+    store(w, base + ROWS.exchanges + (i * N_SOLVED + j) * WIDTH, swap)
+    if any_nonzero(swap):
+        for m in range(j, end):
+            a, b = load(w, row + m * WIDTH), load(w, other + m * WIDTH)
+            store(w, row + m * WIDTH, where_less(0.5, swap, b, a))
+            store(w, other + m * WIDTH, where_less(0.5, swap, a, b))
+
+
+def factorise(w: Any, base: int) -> None:
+    """Factorise the matrix into triangles, by elimination with partial pivoting; keep inverse pivots on the diagonal."""
+    for j in range(N_SOLVED):
+        last, end = min(N_SOLVED, j + 1 + BELOW), min(N_SOLVED, j + 1 + BEHIND)
+        row = base + ROWS.matrix + j * N_SOLVED * WIDTH
+        for i in range(j + 1, last):
+            exchange(w, base, j, i, end)
+        inverse = 1.0 / load(w, row + j * WIDTH)
+        store(w, row + j * WIDTH, inverse)
+        for i in range(j + 1, last):
+            other = base + ROWS.matrix + i * N_SOLVED * WIDTH
+            factor = load(w, other + j * WIDTH) * inverse
+            store(w, other + j * WIDTH, factor)
+            for m in range(j + 1, end):
+                store(w, other + m * WIDTH, load(w, other + m * WIDTH) - factor * load(w, row + m * WIDTH))
+
+
+def solve(w: Any, base: int) -> None:
+    """Replace the right-hand side by the solution of the linear system."""
+    right = base + ROWS.right
+    for j in range(N_SOLVED):
+        last, row = min(N_SOLVED, j + 1 + BELOW), base + ROWS.matrix + j * WIDTH
+        x = load(w, right + j * WIDTH)
+        for i in range(j + 1, last):
+            swap = load(w, base + ROWS.exchanges + (i * N_SOLVED + j) * WIDTH)
+            other = load(w, right + i * WIDTH)
+            store(w, right + i * WIDTH, where_less(0.5, swap, x, other))
+            x = where_less(0.5, swap, other, x)
+        store(w, right + j * WIDTH, x)
+        for i in range(j + 1, last):
+            store(w, right + i * WIDTH, load(w, right + i * WIDTH) - load(w, row + i * N_SOLVED * WIDTH) * x)
+    for k in range(N_SOLVED):
+        j = N_SOLVED - 1 - k
+        row, end = base + ROWS.matrix + j * N_SOLVED * WIDTH, min(N_SOLVED, j + 1 + BEHIND)
+        x = load(w, right + j * WIDTH)
+        for m in range(j + 1, end):
+            x = x - load(w, row + m * WIDTH) * load(w, right + m * WIDTH)
+        store(w, right + j * WIDTH, x * load(w, row + j * WIDTH))
+
+
+def coupled(w: Any, base: int, i: int, s: int) -> Any:
+    """Return gamma times the right-hand side of stage `s` for state `i`, without the change of J along a tangent."""
+    row = base + ROWS.slopes + i * WIDTH
+    total = load(w, row) if s == 1 else load(w, row + s * N * WIDTH)
+    for j in range(1, s):
+        total = multiply_add(COUPLINGS[s, j], load(w, row + j * N * WIDTH), total)
+    if IS_TIMED:
+        total = multiply_add(SHIFTS[s], load(w, base + ROWS.drift + i * WIDTH), total)
+    return GAMMA * total
+
+
+def bent(w: Any, base: int, i: int, s: int, total: Any) -> Any:
+    """Add to the right-hand side for a row `i` of a tangent vector the change of J along it, times the slope of the
+    states.
+    """
+    change = 0.0 * total
+    for k in range(CROSS_STARTS[i - N_SOLVED], CROSS_STARTS[i - N_SOLVED + 1]):
+        entry = load(w, base + ROWS.derivatives + (N_OWN_ENTRIES + k) * WIDTH)
+        slope = load(w, base + ROWS.slopes + (s * N + CROSS_COLUMNS[k]) * WIDTH)
+        change = multiply_add(entry, slope, change)
+    return multiply_add(GAMMA * load(w, base + ROWS.step), change, total)
+
+
+def evaluate_stage(w: Any, base: int, s: int) -> None:
+    """Compute the state at stage `s`, and its rates in the row of the stage's slopes."""
+    h = load(w, base + ROWS.step)
+    for i in range(N):
+        row = base + i * WIDTH
+        total = STAGES[s, 1] * load(w, row + ROWS.slopes + N * WIDTH)
+        for j in range(2, s):
+            total = multiply_add(STAGES[s, j], load(w, row + ROWS.slopes + j * N * WIDTH), total)
+        store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
+    if NODES[s] != NODES[s - 1]:
+        c = load_rows(w, base + ROWS.constants, NC)
+        store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
+    c = load_rows(w, base + ROWS.constants, NC)
+    rates = rhs(load_rows(w, base + ROWS.trial, N_KNOWN), load(w, base + ROWS.forcing), c)
+    store_rows(w, base + ROWS.slopes + s * N * WIDTH, rates)
+
+
+def solve_stage(w: Any, base: int, s: int) -> None:
+    """Compute the slopes of stage `s`, first of the states, then of each tangent vector."""
+    for first in range(0, N - N_SOLVED + 1, N_SOLVED):
+        for i in range(N_SOLVED):
+            total = coupled(w, base, first + i, s)
+            if HAS_CROSS and first > 0:
+                total = bent(w, base, first + i, s, total)
+            store(w, base + ROWS.right + POSITIONS[i] * WIDTH, total)
+        solve(w, base)
+        for i in range(N_SOLVED):
+            row = base + ROWS.slopes + (s * N + first + i) * WIDTH
+            store(w, row, load(w, base + ROWS.right + POSITIONS[i] * WIDTH))
+    # the trace of the Jacobian, on which nothing depends
+    for i in range(N - N % N_SOLVED, N):
+        total = coupled(w, base, i, s)
+        store(w, base + ROWS.slopes + (s * N + i) * WIDTH, bent(w, base, i, s, total) if HAS_CROSS else total)
+
+
+def run_stages_implicit(w: Any, base: int) -> None:
+    """Compute all slopes of a step but the first, which the last step has computed, and the new state."""
+    fill_matrix(w, base)
+    factorise(w, base)
+    for s in range(1, N_STAGES - 1):
+        if s > 1:
+            evaluate_stage(w, base, s)
+        solve_stage(w, base, s)
+    evaluate_stage(w, base, N_STAGES - 1)
+
+
+INLINE = ("coupled", "bent")
+"""Templates of this module that are inlined into their callers; callees come first."""
+
+CALLED = ("fill_matrix", "exchange", "factorise", "solve", "evaluate_stage", "solve_stage")
+"""Templates compiled as functions of their own; `run_stages_implicit` takes the place of `lanes.run_stages`."""

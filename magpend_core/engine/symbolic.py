@@ -1,0 +1,176 @@
+"""Evaluate the functions of a system on symbols, and derive from them what an implicit method needs.
+
+The functions run as plain Python with a symbol in place of each number; every operation on symbols adds a node to an
+expression graph. So derivatives are exact for every system, however its functions were written, and of a system that
+was extended by tangent vectors, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+from magpend_core.engine import simd, vecmath
+from magpend_core.engine.jit import inline
+from magpend_core.engine.plain_python import plain
+from magpend_core.engine.system import System
+from magpend_core.expressions.derivatives import derivatives
+from magpend_core.expressions.graph import Graph, GraphError, Node
+from magpend_core.expressions.writer import SIMD, Writer
+
+
+class Symbol:
+    """Node of an expression graph with the arithmetic of a number."""
+
+    __slots__ = ("graph", "node")
+    __array_ufunc__ = None  # numpy's numbers leave the arithmetic to this class
+
+    def __init__(self, graph: Graph, node: Node) -> None:
+        self.graph, self.node = graph, node
+
+    def __bool__(self) -> bool:
+        raise GraphError("the equations choose by an if, which has no derivative; write simd.where_less")
+
+    def __add__(self, other: Any) -> Symbol:
+        return _made(self.graph.add, self, other)
+
+    def __sub__(self, other: Any) -> Symbol:
+        return _made(self.graph.sub, self, other)
+
+    def __rsub__(self, other: Any) -> Symbol:
+        return _made(self.graph.sub, other, self)
+
+    def __mul__(self, other: Any) -> Symbol:
+        return _made(self.graph.mul, self, other)
+
+    def __truediv__(self, other: Any) -> Symbol:
+        return _made(self.graph.div, self, other)
+
+    def __rtruediv__(self, other: Any) -> Symbol:
+        return _made(self.graph.div, other, self)
+
+    def __pow__(self, other: Any) -> Symbol:
+        return _made(self.graph.power, self, other)
+
+    def __neg__(self) -> Symbol:
+        return _made(self.graph.neg, self)
+
+    def __pos__(self) -> Symbol:
+        return self
+
+    __radd__, __rmul__ = __add__, __mul__
+
+
+def _made(make: Callable[..., Node], *args: Any) -> Symbol:
+    graph = next(a.graph for a in args if isinstance(a, Symbol))
+    return Symbol(graph, make(*(a.node if isinstance(a, Symbol) else graph.number(float(a)) for a in args)))
+
+
+def _called(name: str, own: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls another, or makes its node if an argument is a symbol."""
+
+    def call(*args: Any) -> Any:
+        symbols = [a for a in args if isinstance(a, Symbol)]
+        return _made(lambda *nodes: symbols[0].graph.call(name, *nodes), *args) if symbols else own(*args)
+
+    return call
+
+
+def _where_less(a: Any, b: Any, yes: Any, no: Any) -> Any:
+    symbols = [x for x in (a, b, yes, no) if isinstance(x, Symbol)]
+    return _made(symbols[0].graph.where_less, a, b, yes, no) if symbols else simd.where_less(a, b, yes, no)
+
+
+def _substitutes() -> dict[Callable[..., Any], Callable[..., Any]]:
+    alike = ("exp", "expm1", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "asin", "acos", "atan", "atan2", "sign")
+    calls = {name: _called(name, plain(getattr(vecmath, name))) for name in alike}
+    calls |= {name: _called(name, getattr(simd, name)) for name in ("sqrt", "absolute", "floor", "minimum", "maximum")}
+    power, square = _called("power", plain(vecmath.power)), _called("square", plain(vecmath.square_wave))
+    found = {getattr(simd if name in SIMD else vecmath, name): call for name, call in calls.items()}
+    return found | {
+        simd.where_less: _where_less,
+        simd.multiply_add: lambda a, b, c: a * b + c,
+        simd.copysign: lambda x, s: calls["absolute"](x) * calls["sign"](s),
+        vecmath.expm1: lambda x: calls["exp"](x) - 1.0,
+        vecmath.exp2_falling: lambda x: calls["exp"](x * (1.0 / vecmath.LOG2_E)),
+        vecmath.sincos: lambda x: (calls["sin"](x), calls["cos"](x)),
+        vecmath.inverse_sqrt: lambda x: 1.0 / calls["sqrt"](x),
+        vecmath.power: lambda x, y: x**y if isinstance(x, Symbol) else power(x, y),
+        vecmath.square_wave: square,
+        vecmath.wrapped: lambda x: x - vecmath.TWO_PI * calls["floor"]((x + 0.5 * vecmath.TWO_PI) / vecmath.TWO_PI),
+    }
+
+
+class Linearised(NamedTuple):
+    """Derivatives of a system's rates by its own states and by time, as one compiled function.
+
+    ``function(y, t, c)`` returns them as one tuple: those of the rates by the states without tangent vectors, at the
+    (row, column) in `entries`, then those of the rates in `timed` by time.
+    """
+
+    function: Callable[..., Any]
+    entries: tuple[tuple[int, int], ...]
+    timed: tuple[int, ...]
+
+
+@cache
+def linearised(system: System) -> Linearised:
+    """Derive the derivatives of a system's rates.
+
+    Parameters
+    ----------
+    system
+        System whose rates are smooth but for choices by `simd.where_less`. If it has tangent vectors, derivatives by
+        them are left out.
+
+    Returns
+    -------
+    Linearised
+
+    Raises
+    ------
+    GraphError
+        If the functions do more than arithmetic with functions of `simd` and `vecmath`.
+    """
+    graph, n = Graph(), (system.tangents_of or system).n_states
+    time, drive = graph.leaf("time"), graph.leaf("clock")
+    states = [graph.leaf("state", i) for i in range(system.known)]
+    constants = [graph.leaf("parameter", i) for i in range(system.n_constants + system.n_modes)]
+    y, c = (tuple(Symbol(graph, node) for node in nodes) for nodes in (states, constants))
+    rates = _nodes(graph, _traced(system.rhs, y, Symbol(graph, drive), c))
+    (forcing,) = _nodes(graph, [_traced(system.forcing, Symbol(graph, time), c)])
+    columns = [derivatives(graph, rates, {state: graph.one}) for state in states[:n]]
+    entries = [(i, j) for i in range(len(rates)) for j in range(n) if not columns[j][i].is_number(0.0)]
+    (speed,) = derivatives(graph, (forcing,), {time: graph.one})
+    by_time = derivatives(graph, rates, {drive: speed})
+    timed = [i for i, node in enumerate(by_time) if not node.is_number(0.0)]
+    names = {node.number: f"y[{i}]" for i, node in enumerate(states)} | {time.number: "t", drive.number: "u"}
+    names |= {node.number: f"c[{i}]" for i, node in enumerate(constants)}
+    writer = Writer(names)
+    values = writer.write([*(columns[j][i] for i, j in entries), *(by_time[i] for i in timed)])
+    results = ", ".join(f"zero + {value}" for value in values)
+    lines = ["u = _forcing(t, c)", "zero = 0.0 * y[0]", *writer.lines, f"return ({results},)"]
+    scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_forcing": system.forcing}
+    scope |= {name: getattr(simd, name) for name in SIMD}
+    scope |= {name: getattr(vecmath, name) for name in _WRITTEN}
+    exec("def linearise(y, t, c):\n    " + "\n    ".join(lines) + "\n", scope)
+    return Linearised(inline(scope["linearise"]), tuple(entries), tuple(timed))
+
+
+_WRITTEN = (
+    *("sincos", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "expm1", "log"),
+    *("power", "sign", "square_wave", "inverse_sqrt"),
+)
+"""Functions of `vecmath` that `Writer` writes."""
+
+
+def _traced(function: Callable[..., Any], *args: Any) -> Any:
+    try:
+        return plain(function, _substitutes())(*args)
+    except (TypeError, AttributeError, NotImplementedError) as error:
+        raise GraphError(f"the equations do more than arithmetic: {error}") from error
+
+
+def _nodes(graph: Graph, values: Sequence[Any]) -> tuple[Node, ...]:
+    return tuple(value.node if isinstance(value, Symbol) else graph.number(float(value)) for value in values)
