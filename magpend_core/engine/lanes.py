@@ -1,6 +1,7 @@
 """Integrate many trajectories at once in SIMD lanes, each with its own time, step size and parameters.
 
-The methods are those of Dormand and Prince, of order 5 or 8, and a Rosenbrock method of order 5, with error control. Every trajectory has a lane;
+The methods are those of Dormand and Prince, of order 5 or 8, and Steinebach's Rosenbrock method of order 5, with error
+control. Every trajectory has a lane;
 `simd.WIDTH` lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). Each pass attempts
 one step in all groups; a step is accepted or rejected lane by lane, by `where_less` and not by a branch. Then a
 short scalar pass serves the lanes in which something happened: the end of a time segment between two forcing
@@ -954,21 +955,19 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
     for module in (event_templates, mode_templates):
         templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
     templates |= {key: globals()[key] for key in (*_INLINE, *_CALLED)}
-    if system.is_stiff:
-        own = (*rosenbrock.INLINE, *rosenbrock.CALLED)
-        templates = {key: getattr(rosenbrock, key) for key in own} | templates
-        templates["run_stages"] = rosenbrock.run_stages_implicit
-    elif bindings["CARRIES"]:
-        own = (*tangent_templates.INLINE, *tangent_templates.CALLED)
-        templates = {key: getattr(tangent_templates, key) for key in own} | templates
-        templates["run_stages"] = tangent_templates.run_stages_and_vectors
+    if system.is_stiff or bindings["CARRIES"]:
+        rooms = (tangent_templates, rosenbrock) if system.is_stiff else (tangent_templates,)
+        for room in reversed(rooms):  # callees come first
+            templates = {key: getattr(room, key) for key in (*room.INLINE, *room.CALLED)} | templates
+        templates["run_stages"] = rooms[-1].run_stages
     elif system.n_states <= UNROLLED_STATES + short and not system.is_map:
         templates["run_stages"] = unrolled_stages(system)
     if system.is_map:
         templates["attempt"] = iterate
     if system.tableau.has_two_errors:
         templates["squared_error"] = squared_error_of_two
-    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE, *rosenbrock.INLINE, *_INLINE}
+    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE}
+    dissolving |= {*rosenbrock.INLINE, *_INLINE}
     for key, template in templates.items():
         bindings[key] = bound_part(template, bindings, key in dissolving)
     return bindings

@@ -1,6 +1,6 @@
 """Step with a Rosenbrock method, for stiff systems: linear systems with the Jacobian take the place of explicit stages.
 
-These functions are templates for the engine, see `lanes`; `run_stages_implicit` takes the place of `run_stages`. A step
+These functions are templates for the engine, see `lanes`; `run_stages` takes the place of that of `lanes`. A step
 of length h factorises the matrix I - gamma h J once, by elimination with partial pivoting, and solves for the slope of
 each stage with it (see `tableau.Implicit`). The rows of a lane group are the same at each step; where a lane needs an
 exchange of rows it is made by `where_less`. Elements outside the band of the Jacobian are left out, with the states
@@ -15,7 +15,8 @@ and dense output are the same for both.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -32,11 +33,12 @@ from magpend_core.engine.simd import (
     store_rows,
     where_less,
 )
-from magpend_core.engine.symbolic import linearised
+from magpend_core.engine.symbolic import Linearised, curved, linearised
 from magpend_core.engine.system import System
+from magpend_core.engine.tangents import n_entries
 
 
-def order_of_states(entries: list[tuple[int, int]], n: int) -> np.ndarray:
+def order_of_states(entries: Sequence[tuple[int, int]], n: int) -> np.ndarray:
     """Return the position of each state in the linear systems, shape (n,), from the Jacobian's (row, column) pairs."""
     rows, columns = np.array(entries or [(0, 0)]).T
     pattern = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)).tocsr()
@@ -50,15 +52,42 @@ def order_of_states(entries: list[tuple[int, int]], n: int) -> np.ndarray:
     return position if band(position) < band(same) else same
 
 
+class _Layout(NamedTuple):
+    """Derivatives of a system, and where their rows begin in the work array: of the states, of tangent vectors, of the
+    trace.
+    """
+
+    own: Linearised
+    of_vector: Linearised
+    of_trace: Linearised
+    starts: tuple[int, int, int, int]
+
+
+def _layout(system: System) -> _Layout:
+    n, own = (system.tangents_of or system).n_states, linearised(system)
+    if n_entries(system):
+        of_vector, of_trace = curved(system)
+        sizes = [len(of.entries) + len(of.timed) for of in (own, of_vector, of_trace)]
+        starts = np.cumsum([0, *sizes])
+    else:  # `own` has the rows of the tangent vectors
+        own_entries = tuple(place for place in own.entries if place[0] < n)
+        of_vector = own._replace(entries=tuple((i - n, j) for i, j in own.entries[len(own_entries) :]))
+        of_trace = own
+        first, size = len(own_entries), len(own.entries) + len(own.timed)
+        own = own._replace(entries=own_entries)
+        starts = np.array([0, first, size, size])
+    return _Layout(own, of_vector, of_trace, tuple(int(x) for x in starts))  # type: ignore[arg-type]
+
+
 def implicit_rows(system: System) -> list[int]:
     """Return the numbers of rows of the work array that the method needs; zeros for an explicit method.
 
     They are those of the derivatives, the matrix, its exchanges, the right-hand side, and the rates' change in time.
     """
-    if system.tableau.implicit is None:
+    if not system.is_stiff:
         return [0] * 5
-    n, of = (system.tangents_of or system).n_states, linearised(system)
-    return [len(of.entries) + len(of.timed), n * n, n * n, n, system.n_states if of.timed else 0]
+    n = (system.tangents_of or system).n_states
+    return [_layout(system).starts[-1], n * n, n * n, n, system.n_states]
 
 
 def implicit_bindings(system: System) -> dict[str, Any]:
@@ -66,30 +95,39 @@ def implicit_bindings(system: System) -> dict[str, Any]:
     implicit = system.tableau.implicit
     if implicit is None:
         return {}
-    n, of = (system.tangents_of or system).n_states, linearised(system)
-    own = [(i, j) for i, j in of.entries if i < n]
-    at = order_of_states(own, n)
-    offsets = [int(at[i] - at[j]) for i, j in own]
-    cross = of.entries[len(own) :]
-    starts = np.searchsorted([i for i, _ in cross], np.arange(n, system.n_states + 1))
+    n, (own, of_vector, of_trace, starts) = (system.tangents_of or system).n_states, _layout(system)
+    at = order_of_states(own.entries, n)
+    offsets = [int(at[i] - at[j]) for i, j in own.entries]
+    n_bent = n if n_entries(system) else system.n_states - n
     return {
         "GAMMA": implicit.gamma,
         "COUPLINGS": implicit.couplings,
         "SHIFTS": implicit.shifts,
-        "linearise": of.function,
+        "linearise": own.function,
+        "bend": of_vector.function,
+        "bend_trace": of_trace.function,
         "N_SOLVED": n,
-        "N_OWN_ENTRIES": len(own),
-        "N_ALL_ENTRIES": len(of.entries),
-        "N_TIMED": len(of.timed),
-        "IS_TIMED": bool(of.timed),
-        "HAS_CROSS": len(cross) > 0,
+        "N_OWN_ENTRIES": len(own.entries),
+        "N_DRIFTING": len(own.timed),
+        "N_BENDING": len(of_vector.timed),
+        "N_LEAVING": len(of_trace.timed),
+        "IS_TIMED": len(own.timed) > 0,
+        "AT_BENDS": starts[1] * WIDTH,
+        "AT_TRACE": starts[2] * WIDTH,
+        "AT_DRIFTS": (starts[2] - len(own.timed) if starts[2] == starts[3] else len(own.entries)) * WIDTH,
+        "AT_BENDING": (starts[2] - len(of_vector.timed)) * WIDTH,
+        "AT_LEAVING": (starts[3] - len(of_trace.timed)) * WIDTH,
+        "HAS_CROSS": len(of_vector.entries) > 0,
         "POSITIONS": at,
-        "PLACES": np.array([at[i] * n + at[j] for i, j in own] or [0]),
-        "BELOW": max(0, *offsets),
-        "BEHIND": max(0, *offsets) - min(0, *offsets),
-        "TIMED": np.array(of.timed or (0,)),
-        "CROSS_STARTS": starts,
-        "CROSS_COLUMNS": np.array([j for _, j in cross] or [0]),
+        "PLACES": np.array([at[i] * n + at[j] for i, j in own.entries] or [0]),
+        "BELOW": max(0, *offsets, 0),
+        "BEHIND": max(0, *offsets, 0) - min(0, *offsets, 0),
+        "DRIFTING": np.array(own.timed or (0,)),
+        "BENDING": np.array(of_vector.timed or (0,)),
+        "CROSS_STARTS": np.searchsorted([i for i, _ in of_vector.entries], np.arange(n_bent + 1)),
+        "CROSS_COLUMNS": np.array([j for _, j in of_vector.entries] or [0]),
+        "TRACE_COLUMNS": np.array([j for _, j in of_trace.entries] or [0]),
+        "N_TRACE_ENTRIES": len(of_trace.entries),
     }
 
 
@@ -108,11 +146,11 @@ def fill_matrix(w: Any, base: int) -> None:
         entry = load(w, base + ROWS.derivatives + k * WIDTH)
         store(w, at, load(w, at) - (GAMMA * h) * entry)
     if IS_TIMED:
-        first = base + ROWS.derivatives + N_ALL_ENTRIES * WIDTH
         for i in range(N):
             store(w, base + ROWS.drift + i * WIDTH, 0.0 * h)
-        for k in range(N_TIMED):
-            store(w, base + ROWS.drift + TIMED[k] * WIDTH, h * load(w, first + k * WIDTH))
+        for k in range(N_DRIFTING):
+            drift = load(w, base + ROWS.derivatives + AT_DRIFTS + k * WIDTH)
+            store(w, base + ROWS.drift + DRIFTING[k] * WIDTH, h * drift)
 
 
 def exchange(w: Any, base: int, j: int, i: int, end: int) -> None:
@@ -131,7 +169,7 @@ def exchange(w: Any, base: int, j: int, i: int, end: int) -> None:
 
 
 def factorise(w: Any, base: int) -> None:
-    """Factorise the matrix into triangles, by elimination with partial pivoting; keep inverse pivots on the diagonal."""
+    """Factorise the matrix into triangles by elimination with partial pivoting; keep inverse pivots on the diagonal."""
     for j in range(N_SOLVED):
         last, end = min(N_SOLVED, j + 1 + BELOW), min(N_SOLVED, j + 1 + BEHIND)
         row = base + ROWS.matrix + j * N_SOLVED * WIDTH
@@ -181,13 +219,14 @@ def coupled(w: Any, base: int, i: int, s: int) -> Any:
     return GAMMA * total
 
 
-def bent(w: Any, base: int, i: int, s: int, total: Any) -> Any:
-    """Add to the right-hand side for a row `i` of a tangent vector the change of J along it, times the slope of the
-    states.
+def bent(w: Any, base: int, r: int, s: int, total: Any) -> Any:
+    """Add to a right-hand side for a tangent vector the change of J along it, times the slope of the states.
+
+    `r` is the row among those of `AT_BENDS`.
     """
     change = 0.0 * total
-    for k in range(CROSS_STARTS[i - N_SOLVED], CROSS_STARTS[i - N_SOLVED + 1]):
-        entry = load(w, base + ROWS.derivatives + (N_OWN_ENTRIES + k) * WIDTH)
+    for k in range(CROSS_STARTS[r], CROSS_STARTS[r + 1]):
+        entry = load(w, base + ROWS.derivatives + AT_BENDS + k * WIDTH)
         slope = load(w, base + ROWS.slopes + (s * N + CROSS_COLUMNS[k]) * WIDTH)
         change = multiply_add(entry, slope, change)
     return multiply_add(GAMMA * load(w, base + ROWS.step), change, total)
@@ -196,51 +235,113 @@ def bent(w: Any, base: int, i: int, s: int, total: Any) -> Any:
 def evaluate_stage(w: Any, base: int, s: int) -> None:
     """Compute the state at stage `s`, and its rates in the row of the stage's slopes."""
     h = load(w, base + ROWS.step)
-    for i in range(N):
-        row = base + i * WIDTH
-        total = STAGES[s, 1] * load(w, row + ROWS.slopes + N * WIDTH)
-        for j in range(2, s):
-            total = multiply_add(STAGES[s, j], load(w, row + ROWS.slopes + j * N * WIDTH), total)
-        store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
-    if NODES[s] != NODES[s - 1]:
+    for i in range(N_KNOWN):
+        stage_row(w, base + i * WIDTH, s, h)
+    if s == 1 or NODES[s] != NODES[s - 1]:
         c = load_rows(w, base + ROWS.constants, NC)
         store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
     c = load_rows(w, base + ROWS.constants, NC)
-    rates = rhs(load_rows(w, base + ROWS.trial, N_KNOWN), load(w, base + ROWS.forcing), c)
-    store_rows(w, base + ROWS.slopes + s * N * WIDTH, rates)
+    y, u = load_rows(w, base + ROWS.trial, N_KNOWN), load(w, base + ROWS.forcing)
+    slopes = rhs(y, u, c)
+    if CARRIES:
+        store_rows(w, base + ROWS.entries + (s - 1) * N_ENTRIES * WIDTH, tangent_entries(y, u, c))
+    store_rows(w, base + ROWS.slopes + s * N * WIDTH, slopes)
+
+
+def store_solution(w: Any, base: int, first: int, s: int) -> None:
+    """Solve for the slopes of stage `s` of `N_SOLVED` rows from `first` on, whose right-hand side is set."""
+    solve(w, base)
+    for i in range(N_SOLVED):
+        row = base + ROWS.slopes + (s * N + first + i) * WIDTH
+        store(w, row, load(w, base + ROWS.right + POSITIONS[i] * WIDTH))
 
 
 def solve_stage(w: Any, base: int, s: int) -> None:
-    """Compute the slopes of stage `s`, first of the states, then of each tangent vector."""
-    for first in range(0, N - N_SOLVED + 1, N_SOLVED):
+    """Compute the slopes of stage `s`: first of the states, then of each tangent vector whose rates `rhs` returns."""
+    for first in range(0, N_KNOWN - N_SOLVED + 1, N_SOLVED):
         for i in range(N_SOLVED):
             total = coupled(w, base, first + i, s)
             if HAS_CROSS and first > 0:
-                total = bent(w, base, first + i, s, total)
+                total = bent(w, base, first + i - N_SOLVED, s, total)
             store(w, base + ROWS.right + POSITIONS[i] * WIDTH, total)
-        solve(w, base)
-        for i in range(N_SOLVED):
-            row = base + ROWS.slopes + (s * N + first + i) * WIDTH
-            store(w, row, load(w, base + ROWS.right + POSITIONS[i] * WIDTH))
+        store_solution(w, base, first, s)
     # the trace of the Jacobian, on which nothing depends
-    for i in range(N - N % N_SOLVED, N):
+    for i in range(N_KNOWN - N_KNOWN % N_SOLVED, N_KNOWN):
         total = coupled(w, base, i, s)
-        store(w, base + ROWS.slopes + (s * N + i) * WIDTH, bent(w, base, i, s, total) if HAS_CROSS else total)
+        store(
+            w, base + ROWS.slopes + (s * N + i) * WIDTH, bent(w, base, i - N_SOLVED, s, total) if HAS_CROSS else total
+        )
 
 
-def run_stages_implicit(w: Any, base: int) -> None:
+def step_vector(w: Any, base: int, k: int) -> None:
+    """Compute the slopes of tangent vector `k` at all stages but the first, and its new value; the engine has the
+    entries of J at each stage.
+    """
+    h, first = load(w, base + ROWS.step), N_SOLVED * (1 + k)
+    y, v = load_rows(w, base + ROWS.state, N_SOLVED), load_rows(w, base + ROWS.state + first * WIDTH, N_SOLVED)
+    c = load_rows(w, base + ROWS.constants, NC)
+    store_rows(w, base + ROWS.derivatives + AT_BENDS, bend(y, v, load(w, base + ROWS.time), c))
+    for i in range(N_BENDING):
+        drift = load(w, base + ROWS.derivatives + AT_BENDING + i * WIDTH)
+        store(w, base + ROWS.drift + (first + BENDING[i]) * WIDTH, h * drift)
+    for s in range(1, N_STAGES):
+        multiply_vector(w, base, k, s, h)
+        if s < N_STAGES - 1:
+            for i in range(N_SOLVED):
+                total = bent(w, base, i, s, coupled(w, base, first + i, s))
+                store(w, base + ROWS.right + POSITIONS[i] * WIDTH, total)
+            store_solution(w, base, first, s)
+
+
+def step_trace(w: Any, base: int) -> None:
+    """Compute the integral of the Jacobian's trace, the last row, at all stages but the first."""
+    h, row = load(w, base + ROWS.step), base + (N - 1) * WIDTH
+    y, c = load_rows(w, base + ROWS.state, N_SOLVED), load_rows(w, base + ROWS.constants, NC)
+    store_rows(w, base + ROWS.derivatives + AT_TRACE, bend_trace(y, load(w, base + ROWS.time), c))
+    if N_LEAVING > 0:
+        store(w, row + ROWS.drift, h * load(w, base + ROWS.derivatives + AT_LEAVING))
+    for s in range(1, N_STAGES):
+        trace = load(w, base + ROWS.entries + (s * N_ENTRIES - 1) * WIDTH)
+        store(w, row + ROWS.slopes + s * N * WIDTH, trace)
+        if s < N_STAGES - 1:
+            change = 0.0 * h
+            for m in range(N_TRACE_ENTRIES):
+                entry = load(w, base + ROWS.derivatives + AT_TRACE + m * WIDTH)
+                slope = load(w, base + ROWS.slopes + (s * N + TRACE_COLUMNS[m]) * WIDTH)
+                change = multiply_add(entry, slope, change)
+            total = multiply_add(GAMMA * h, change, coupled(w, base, N - 1, s))
+            store(w, row + ROWS.slopes + s * N * WIDTH, total)
+    stage_row(w, row, N_STAGES - 1, h)
+
+
+def run_stages(w: Any, base: int) -> None:
     """Compute all slopes of a step but the first, which the last step has computed, and the new state."""
     fill_matrix(w, base)
     factorise(w, base)
     for s in range(1, N_STAGES - 1):
-        if s > 1:
+        if s > 1 or CARRIES:
             evaluate_stage(w, base, s)
         solve_stage(w, base, s)
     evaluate_stage(w, base, N_STAGES - 1)
+    if CARRIES:
+        for k in range(N_VECTORS):
+            step_vector(w, base, k)
+        if HAS_TRACE:
+            step_trace(w, base)
 
 
 INLINE = ("coupled", "bent")
 """Templates of this module that are inlined into their callers; callees come first."""
 
-CALLED = ("fill_matrix", "exchange", "factorise", "solve", "evaluate_stage", "solve_stage")
-"""Templates compiled as functions of their own; `run_stages_implicit` takes the place of `lanes.run_stages`."""
+CALLED = (
+    "fill_matrix",
+    "exchange",
+    "factorise",
+    "solve",
+    "store_solution",
+    "evaluate_stage",
+    "solve_stage",
+    "step_vector",
+    "step_trace",
+)
+"""Templates compiled as functions of their own; `run_stages` takes the place of `lanes.run_stages`."""

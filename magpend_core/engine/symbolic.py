@@ -18,6 +18,7 @@ from magpend_core.engine.system import System
 from magpend_core.expressions.derivatives import derivatives
 from magpend_core.expressions.graph import Graph, GraphError, Node
 from magpend_core.expressions.writer import SIMD, Writer
+from magpend_core.sizes import MAX_STATES
 
 
 class Symbol:
@@ -83,7 +84,7 @@ def _where_less(a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 
 def _substitutes() -> dict[Callable[..., Any], Callable[..., Any]]:
-    alike = ("exp", "expm1", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "asin", "acos", "atan", "atan2", "sign")
+    alike = ("exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "asin", "acos", "atan", "atan2", "sign")
     calls = {name: _called(name, plain(getattr(vecmath, name))) for name in alike}
     calls |= {name: _called(name, getattr(simd, name)) for name in ("sqrt", "absolute", "floor", "minimum", "maximum")}
     power, square = _called("power", plain(vecmath.power)), _called("square", plain(vecmath.square_wave))
@@ -103,15 +104,68 @@ def _substitutes() -> dict[Callable[..., Any], Callable[..., Any]]:
 
 
 class Linearised(NamedTuple):
-    """Derivatives of a system's rates by its own states and by time, as one compiled function.
+    """Derivatives of functions of states and time by the states and by time, as one compiled function.
 
-    ``function(y, t, c)`` returns them as one tuple: those of the rates by the states without tangent vectors, at the
-    (row, column) in `entries`, then those of the rates in `timed` by time.
+    ``function(y, t, c)`` returns them as one tuple: those by the states, at the (row, column) in `entries`, then those
+    of the rows in `timed` by time.
     """
 
     function: Callable[..., Any]
     entries: tuple[tuple[int, int], ...]
     timed: tuple[int, ...]
+
+
+class _Traced:
+    """Rates of a system, and its forcing, as expressions of states, time and constants."""
+
+    def __init__(self, system: System) -> None:
+        self.system, self.graph = system, Graph()
+        graph, n = self.graph, (system.tangents_of or system).n_states
+        self.time, self.drive = graph.leaf("time"), graph.leaf("clock")
+        self.states = [graph.leaf("state", i) for i in range(system.known)]
+        self.own = self.states[:n]
+        self.vector = [graph.leaf("rate", i) for i in range(n)]
+        constants = [graph.leaf("parameter", i) for i in range(system.n_constants + system.n_modes)]
+        y, c = (tuple(Symbol(graph, node) for node in nodes) for nodes in (self.states, constants))
+        self.rates = _nodes(graph, _called_plain(system.rhs, y, Symbol(graph, self.drive), c))
+        forcing = _nodes(graph, [_called_plain(system.forcing, Symbol(graph, self.time), c)])
+        (self.speed,) = derivatives(graph, forcing, {self.time: graph.one})
+        self.names = {node.number: f"y[{i}]" for i, node in enumerate(self.states)}
+        self.names |= {node.number: f"v[{i}]" for i, node in enumerate(self.vector)}
+        self.names |= {node.number: f"c[{i}]" for i, node in enumerate(constants)}
+        self.names |= {self.time.number: "t", self.drive.number: "u"}
+
+    def along_vector(self) -> tuple[Node, ...]:
+        """Return the products of the Jacobian and a vector."""
+        return tuple(derivatives(self.graph, self.rates, dict(zip(self.own, self.vector, strict=True))))
+
+    def trace(self) -> Node:
+        """Return the trace of the Jacobian."""
+        pairs = zip(self.rates, self.own, strict=True)
+        return self.graph.add(*(derivatives(self.graph, (rate,), {x: self.graph.one})[0] for rate, x in pairs))
+
+    def linearised(self, roots: tuple[Node, ...], arguments: str) -> Linearised:
+        """Compile the derivatives of expressions by the states, without tangent vectors, and by time."""
+        graph = self.graph
+        columns = [derivatives(graph, roots, {state: graph.one}) for state in self.own]
+        places = [(i, j) for i in range(len(roots)) for j in range(len(self.own))]
+        entries = [(i, j) for i, j in places if not columns[j][i].is_number(0.0)]
+        by_time = derivatives(graph, roots, {self.drive: self.speed})
+        timed = [i for i, node in enumerate(by_time) if not node.is_number(0.0)]
+        writer = Writer(self.names)
+        values = writer.write([*(columns[j][i] for i, j in entries), *(by_time[i] for i in timed)])
+        results = "".join(f"zero + {value}, " for value in values)
+        lines = ["u = _forcing(t, c)", "zero = 0.0 * y[0]", *writer.lines, f"return ({results})"]
+        scope: dict[str, Any] = {"__name__": self.system.rhs.__module__, "_forcing": self.system.forcing}
+        scope |= {name: getattr(simd, name) for name in SIMD}
+        scope |= {name: getattr(vecmath, name) for name in _WRITTEN}
+        exec(f"def linearise({arguments}):\n    " + "\n    ".join(lines) + "\n", scope)
+        return Linearised(inline(scope["linearise"]), tuple(entries), tuple(timed))
+
+
+@cache
+def _traced(system: System) -> _Traced:
+    return _Traced(system)
 
 
 @cache
@@ -133,29 +187,19 @@ def linearised(system: System) -> Linearised:
     GraphError
         If the functions do more than arithmetic with functions of `simd` and `vecmath`.
     """
-    graph, n = Graph(), (system.tangents_of or system).n_states
-    time, drive = graph.leaf("time"), graph.leaf("clock")
-    states = [graph.leaf("state", i) for i in range(system.known)]
-    constants = [graph.leaf("parameter", i) for i in range(system.n_constants + system.n_modes)]
-    y, c = (tuple(Symbol(graph, node) for node in nodes) for nodes in (states, constants))
-    rates = _nodes(graph, _traced(system.rhs, y, Symbol(graph, drive), c))
-    (forcing,) = _nodes(graph, [_traced(system.forcing, Symbol(graph, time), c)])
-    columns = [derivatives(graph, rates, {state: graph.one}) for state in states[:n]]
-    entries = [(i, j) for i in range(len(rates)) for j in range(n) if not columns[j][i].is_number(0.0)]
-    (speed,) = derivatives(graph, (forcing,), {time: graph.one})
-    by_time = derivatives(graph, rates, {drive: speed})
-    timed = [i for i, node in enumerate(by_time) if not node.is_number(0.0)]
-    names = {node.number: f"y[{i}]" for i, node in enumerate(states)} | {time.number: "t", drive.number: "u"}
-    names |= {node.number: f"c[{i}]" for i, node in enumerate(constants)}
-    writer = Writer(names)
-    values = writer.write([*(columns[j][i] for i, j in entries), *(by_time[i] for i in timed)])
-    results = ", ".join(f"zero + {value}" for value in values)
-    lines = ["u = _forcing(t, c)", "zero = 0.0 * y[0]", *writer.lines, f"return ({results},)"]
-    scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_forcing": system.forcing}
-    scope |= {name: getattr(simd, name) for name in SIMD}
-    scope |= {name: getattr(vecmath, name) for name in _WRITTEN}
-    exec("def linearise(y, t, c):\n    " + "\n    ".join(lines) + "\n", scope)
-    return Linearised(inline(scope["linearise"]), tuple(entries), tuple(timed))
+    traced = _traced(system)
+    return traced.linearised(traced.rates, "y, t, c")
+
+
+@cache
+def curved(system: System) -> tuple[Linearised, Linearised]:
+    """Derive the derivatives of J v, with the Jacobian J of a system's rates and a vector v, and of the trace of J.
+
+    The function of the first has the arguments ``(y, v, t, c)``. The trace has one row.
+    """
+    traced = _traced(system)
+    of_vector = traced.linearised(traced.along_vector(), "y, v, t, c")
+    return of_vector, traced.linearised((traced.trace(),), "y, t, c")
 
 
 _WRITTEN = (
@@ -165,11 +209,23 @@ _WRITTEN = (
 """Functions of `vecmath` that `Writer` writes."""
 
 
-def _traced(function: Callable[..., Any], *args: Any) -> Any:
+def _called_plain(function: Callable[..., Any], *args: Any) -> Any:
     try:
         return plain(function, _substitutes())(*args)
     except (TypeError, AttributeError, NotImplementedError) as error:
         raise GraphError(f"the equations do more than arithmetic: {error}") from error
+
+
+def implicit_problem(system: System) -> str | None:
+    """Return why a system cannot be integrated by an implicit method, as a sentence; None if it can."""
+    n = (system.tangents_of or system).n_states
+    if n > MAX_STATES:
+        return f"{system.name} has {n} states; rodas5p solves linear systems of at most {MAX_STATES}; choose dopri5."
+    try:
+        linearised(system)
+    except GraphError as error:
+        return f"rodas5p needs derivatives of the equations of {system.name}: {error}; or choose dopri5."
+    return None
 
 
 def _nodes(graph: Graph, values: Sequence[Any]) -> tuple[Node, ...]:

@@ -57,8 +57,8 @@ class Tableau(NamedTuple):
     order : int
         Of the estimate that steps are chosen by.
     dense : ndarray, (n_stages, 4)
-        The continuous extension is y(t + x h) = y + h sum_i k_i P_i(x) with P_i(x) = sum_j dense[i, j] x^(j + 1) and the
-        slopes k_i; zeros for none.
+        Of the continuous extension y(t + x h) = y + h sum_i k_i P_i(x) with the slopes k_i and
+        P_i(x) = sum_j dense[i, j] x^(j + 1); zeros for none.
     implicit : Implicit or None
         What a Rosenbrock method has besides. Its slopes between the first and the last are solutions of linear systems.
     """
@@ -222,11 +222,22 @@ _ERROR_3: dict[int, float] = {
 
 _ERRORS_8 = _filled([_ERROR_5, _ERROR_3], 13)
 
-# Steinebach's Rodas5P, of order 5, stiffly accurate and L-stable: G. Steinebach, BIT Numer. Math. 63 (2023) 27, with the
-# coefficients of OrdinaryDiffEq.jl (MIT licence) to all digits. Stages there are numbered from 1; slope 0 here is the
-# rate at the step's begin, and slope 9 that at its end.
+# Steinebach's Rodas5P, of order 5, stiffly accurate and L-stable: G. Steinebach, BIT Numer. Math. 63 (2023) 27, with
+# the coefficients of OrdinaryDiffEq.jl (MIT licence) to all digits. Stages there are numbered from 1; slope 0 here is
+# the rate at the step's begin, and slope 9 that at its end.
 _GAMMA = 0.21193756319429014
-_NODES_P = [0.0, 0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0, 1.0]
+_NODES_P = [
+    0.0,
+    0.0,
+    0.6358126895828704,
+    0.4095798393397535,
+    0.9769306725060716,
+    0.4288403609558664,
+    1.0,
+    1.0,
+    1.0,
+    1.0,
+]
 _LAST_P = [-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946]
 _STAGES_P = [
     [],

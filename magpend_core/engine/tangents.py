@@ -119,24 +119,29 @@ def stage_row(w: Any, row: int, s: int, h: Any) -> None:
     store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
 
 
+def multiply_vector(w: Any, base: int, k: int, s: int, h: Any) -> None:
+    """Compute the state of tangent vector `k` at stage `s`, and its product with the Jacobian there."""
+    first = base + N_KNOWN * (1 + k) * WIDTH
+    for i in range(N_KNOWN):
+        stage_row(w, first + i * WIDTH, s, h)
+    entries = base + ROWS.entries + (s - 1) * N_ENTRIES * WIDTH
+    vector, slopes = first + ROWS.trial, first + ROWS.slopes + s * N * WIDTH
+    for i in range(N_KNOWN):
+        at, end = ROW_STARTS[i], ROW_STARTS[i + 1]
+        total = 0.0 * h
+        if at < end:
+            total = load(w, entries + at * WIDTH) * load(w, vector + ENTRY_COLUMNS[at] * WIDTH)
+        for p in range(at + 1, end):
+            entry = load(w, entries + p * WIDTH)
+            total = multiply_add(entry, load(w, vector + ENTRY_COLUMNS[p] * WIDTH), total)
+        store(w, slopes + i * WIDTH, total)
+
+
 def carry_vector(w: Any, base: int, k: int) -> None:
     """Compute the states and slopes of tangent vector `k` at all Runge-Kutta stages but the first."""
     h = load(w, base + ROWS.step)
-    first = base + N_KNOWN * (1 + k) * WIDTH
     for s in range(1, N_STAGES):
-        for i in range(N_KNOWN):
-            stage_row(w, first + i * WIDTH, s, h)
-        entries = base + ROWS.entries + (s - 1) * N_ENTRIES * WIDTH
-        vector, slopes = first + ROWS.trial, first + ROWS.slopes + s * N * WIDTH
-        for i in range(N_KNOWN):
-            at, end = ROW_STARTS[i], ROW_STARTS[i + 1]
-            total = 0.0 * h
-            if at < end:
-                total = load(w, entries + at * WIDTH) * load(w, vector + ENTRY_COLUMNS[at] * WIDTH)
-            for p in range(at + 1, end):
-                entry = load(w, entries + p * WIDTH)
-                total = multiply_add(entry, load(w, vector + ENTRY_COLUMNS[p] * WIDTH), total)
-            store(w, slopes + i * WIDTH, total)
+        multiply_vector(w, base, k, s, h)
 
 
 def carry_trace(w: Any, base: int) -> None:
@@ -149,7 +154,7 @@ def carry_trace(w: Any, base: int) -> None:
         store(w, row + ROWS.slopes + s * N * WIDTH, trace)
 
 
-def run_stages_and_vectors(w: Any, base: int) -> None:
+def run_stages(w: Any, base: int) -> None:
     """Compute all Runge-Kutta stages but the first: of the states, then of each tangent vector, then of the trace
     integral.
     """
@@ -161,8 +166,8 @@ def run_stages_and_vectors(w: Any, base: int) -> None:
         carry_trace(w, base)
 
 
-INLINE = ("stage_row",)
+INLINE = ("stage_row", "multiply_vector")
 """Templates of this module that are inlined into their callers; callees come first."""
 
 CALLED = ("carry_vector", "carry_trace")
-"""Templates compiled as functions of their own; `run_stages_and_vectors` takes the place of `lanes.run_stages`."""
+"""Templates compiled as functions of their own; `run_stages` takes the place of `lanes.run_stages`."""

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from magpend_core import evaluate, sections
 from magpend_core.engine.plain_python import plain
+from magpend_core.expressions import graph
 from magpend_core.models import ModelError
-from magpend_core.models.text import graph
 from magpend_core.models.text.grammar import FUNCTIONS, parse
 from magpend_core.models.text.numeric import value_of
 from tests.core.flows import model_of
