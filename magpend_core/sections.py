@@ -132,8 +132,8 @@ def run_branches(
         crossings, and the system must be without forcing. A start need not be on the section.
 
     method
-        ``"dopri5"`` of order 5, or ``"dop853"`` of order 8 for smooth equations; None for that of `system`.
-        See `System.method`.
+        ``"dopri5"`` of order 5, ``"dop853"`` of order 8 for smooth equations, or ``"rodas5p"`` for stiff ones; None
+        for that of `system`, ``"dopri5"`` by default: only a run decides by itself. See `System.method`.
 
     Returns
     -------

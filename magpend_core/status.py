@@ -33,6 +33,15 @@ class Status(IntEnum):
             return self.sentence
         return f"{self.sentence} {see(self.name.lower().replace('_', '-'))}"
 
+    def advice_for(self, method: str) -> str:
+        """Return the advice to a run by a method, which that on the step limit names."""
+        if self != Status.STEP_LIMIT:
+            return self.advice
+        words = self.advice if method != "rodas5p" else self.advice.replace(_IF_STIFF, "")
+        return words.replace("more steps than", f"more steps of {method} than")
+
+
+_IF_STIFF = 'if the equations are stiff, set method = "rodas5p"; else '
 
 _SENTENCES = {
     Status.PENDING: "not computed yet; run the same command again to complete it",
@@ -40,7 +49,7 @@ _SENTENCES = {
     Status.BOUNDED: "bounded, and not closed within the periods integrated and the longest period looked "
     "for: chaotic, quasi-periodic, or still on the way to an orbit",
     Status.DIVERGED: "a state left the bounds of the system or is not a number",
-    Status.STEP_LIMIT: "one period needed more steps than max_steps_per_period; raise it, or loosen rtol; "
+    Status.STEP_LIMIT: f"one period needed more steps than max_steps_per_period; {_IF_STIFF}raise it, or loosen rtol; "
     "neither helps where impacts or switches follow one another without end: change these",
     Status.STEP_UNDERFLOW: "the step size fell below the resolution of time; loosen rtol and atol",
     Status.UNREACHED: "the branch ended at an earlier point of its path, so this point was not computed",

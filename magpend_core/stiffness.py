@@ -1,7 +1,8 @@
-"""Find the fastest contraction of a system's equations, which bounds the step of an explicit method."""
+"""Find the rates of a system's equations that bound the step of an explicit method."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -39,14 +40,43 @@ def fastest_contraction(system: System, parameters: np.ndarray, frequency_hz: np
     """
     if system.jacobian is None:
         return 0.0
-    constants = plain(system.constants)
     fastest = 0.0
+    for y, c in _with_constants(system, parameters, frequency_hz, states):
+        for state in (y, *_in_layers(system, y, c)):
+            fastest = max(fastest, -float(np.linalg.eigvals(_jacobian(system, state, c)).real.min()))
+    return fastest
+
+
+def spectral_radii(system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Return the spectral radius of the Jacobian at given states [1/s], in plain Python; 0 where a state is no number.
+
+    Parameters
+    ----------
+    system
+        With a Jacobian.
+    parameters, frequency_hz, states
+        As for `fastest_contraction`.
+
+    Returns
+    -------
+    ndarray, (cell,)
+    """
+    found = []
+    for y, c in _with_constants(system, parameters, frequency_hz, states):
+        matrix = _jacobian(system, y, c)
+        found.append(np.abs(np.linalg.eigvals(matrix)).max() if np.isfinite(matrix).all() else 0.0)
+    return np.array(found)
+
+
+def _with_constants(
+    system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray
+) -> Iterator[tuple[np.ndarray, tuple[Any, ...]]]:
+    """Yield each state with the constants of its cell."""
+    constants = plain(system.constants)
     for p, hz, y in zip(parameters, frequency_hz, states, strict=True):
         c = np.zeros(system.n_constants + system.n_modes)
         constants(float(hz), p, c)
-        for state in (y, *_in_layers(system, y, tuple(c))):
-            fastest = max(fastest, -float(np.linalg.eigvals(_jacobian(system, state, tuple(c))).real.min()))
-    return fastest
+        yield y, tuple(c)
 
 
 def _jacobian(system: System, y: np.ndarray, c: tuple[Any, ...]) -> np.ndarray:

@@ -203,6 +203,7 @@ def status(directory: Directory, json: Json = None) -> None:
         "committed_cells": found.n_committed,
         "tasks": found.plan.n_tasks,
         "committed_tasks": len(found.commits),
+        "method": found.spec.integration.method,
         "status": dict(found.cells),
     }
     tell(Table([row], describe_state(found)), None, json)

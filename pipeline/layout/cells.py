@@ -287,6 +287,15 @@ class CellMap:
             states += self.origins.at(parameters[:, 0], frequency[:, 0])
         return Inputs(parameters, frequency, states)
 
+    def spread(self, n: int) -> Inputs:
+        """Return the inputs of at most `n` cells, evenly spread over the run."""
+        n_cells = math.prod(self.shape)
+        rows = np.unique(np.linspace(0, n_cells - 1, min(n, n_cells)).astype(np.int64))
+        places = [np.unravel_index(row, self.shape) if self.shape else () for row in rows]
+        found = [self.inputs(tuple(slice(int(i), int(i) + 1) for i in place)) for place in places]
+        parts = ("parameters", "frequency_hz", "initial_states")
+        return Inputs(*(np.concatenate([getattr(one, name) for one in found]) for name in parts))
+
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """Return slices that select the last cell of each branch of a block. All branches of the block must run in the
         same direction.

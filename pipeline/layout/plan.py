@@ -29,7 +29,7 @@ from pipeline.products.product import Variable
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
-from pipeline.specification.tables import FREQUENCY
+from pipeline.specification.tables import AUTO, EXPLICIT, FREQUENCY
 
 LEAST_LATTICE = 64
 """Cells of the first lattice in a tile of a refined grid, about, if 64 MB hold them.
@@ -57,6 +57,8 @@ class Plan:
     cells: CellMap = field(compare=False, repr=False)
     block: tuple[int, ...]  # cells of a task, per dim
     text: str = field(default="", compare=False, repr=False)  # TOML text of the specification
+    # whether `pipeline.runs.methods` has still to decide the method; until then it is explicit
+    undecided: bool = field(default=False, compare=False, repr=False)
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -231,7 +233,10 @@ def make_plan(spec: Spec, text: str = "") -> Plan:
     SpecError
         If there are too many tasks or branches, or chunks that cannot be written; the message lists all problems.
     """
-    draft = Plan(spec, CellMap(spec), (), text)
+    is_open = spec.integration.method == AUTO
+    spec = spec.by_method(EXPLICIT) if is_open else spec
+    has_steps = spec.model.clock.is_continuous and spec.noise is None
+    draft = Plan(spec, CellMap(spec), (), text, is_open and has_steps)
     wanted = spec.execution.trajectories_per_task or _trajectories(draft)
     if spec.continuation is not None:
         block = _walk_block(draft, wanted)

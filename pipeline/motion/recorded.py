@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -54,7 +54,7 @@ class Recorded(Steady):
             inputs.initial_states,
             ends=self.drive.section_ends,
             **self.settings,
-            system=self.model.system,  # the specification refuses another method
+            system=replace(self.model.system, method=self.integration.method),
             quantities=quantities,
         )
         return cells, {}

@@ -121,7 +121,7 @@ def _wide(run: RunDirectory, spec: str | Path | None, widening: Widening) -> tup
         raise SpecError("extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM.")
     if spec is not None:
         path = find_spec(spec)
-        parsed = with_sizes(Spec.read(path), run.spec)
+        parsed = with_sizes(Spec.read(path), run.spec).keeping_method(run.spec)
         if not widening:
             return parsed, path.read_text("utf-8")
         wide, origin = widened(parsed, widening), f"specification {path.name}"

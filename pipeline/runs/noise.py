@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import Plan
 from pipeline.motion.noisy import Noisy
 from pipeline.motion.steady import Inputs
@@ -40,7 +39,7 @@ def check_steps(plan: Plan) -> None:
     spec, motion = plan.spec, plan.spec.motion
     if not isinstance(motion, Noisy):
         return
-    inputs = _sample(plan.cells)
+    inputs = plan.cells.spread(SAMPLE)
     if problem := _stiff_problem(motion, inputs):
         raise SpecError([problem])
     few = min(PERIODS, spec.integration.n_transient + spec.integration.n_keep)
@@ -71,17 +70,6 @@ def warn_of_steps(run: RunDirectory, echo: Callable[[str], None]) -> None:
             f"warning: in {n_above} of {n} cells the last period changes by more than noise.tolerance = "
             f"{tolerance:g} when its steps are halved (at most {np.nanmax(error):.2g}); take shorter steps."
         )
-
-
-def _sample(cells: CellMap) -> Inputs:
-    """Return the inputs of cells evenly spread over a run."""
-    n_cells = int(np.prod(cells.shape))
-    rows = np.unique(np.linspace(0, n_cells - 1, min(SAMPLE, n_cells)).astype(np.int64))
-    found = []
-    for place in np.stack(np.unravel_index(rows, cells.shape), axis=1).tolist():
-        found.append(cells.inputs(tuple(slice(i, i + 1) for i in place)))
-    parts = ("parameters", "frequency_hz", "initial_states")
-    return Inputs(*(np.concatenate([getattr(one, name) for one in found]) for name in parts))
 
 
 def _stiff_problem(motion: Noisy, inputs: Inputs) -> str | None:

@@ -15,6 +15,7 @@ from pipeline.layout.plan import Plan, check_space
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.products.registry import FIGURES
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
+from pipeline.runs.methods import decided
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import prepare
 from pipeline.runs.suitability import overview, unsuited
@@ -177,11 +178,21 @@ class Preview:
         return self.plan.n_bytes
 
     @cached_property
+    def _decision(self) -> tuple[Plan, list[str]]:
+        told: list[str] = []
+        return decided(self.plan, told.append), told
+
+    @property
+    def decided(self) -> Plan:
+        """The plan with the method of the run, which may be decided at the first use."""
+        return self._decision[0]
+
+    @cached_property
     def times(self) -> Times:
         """Time of the missing cells, measured on some of them at the first use."""
         missing = set(range(self.n_tasks)) - self.done
         share = sum(self.plan.cells_in(i) for i in missing) / self.n_cells
-        return times(self.plan, share, len(missing), self.workers)
+        return times(self.decided, share, len(missing), self.workers)
 
     @property
     def lines(self) -> Iterator[str]:
@@ -198,6 +209,7 @@ class Preview:
         yield f"tasks: {self.n_tasks} of {block} cells, {len(self.done)} done"
         yield f"cube: {size(self.n_bytes)} before compression"
         yield f"directory: {self.directory}" + ("" if self.exists else " (not created)")
+        yield from self._decision[1]
         yield self.times.line
 
     def __repr__(self) -> str:

@@ -18,8 +18,9 @@ from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.evaluation import check_starts
 from pipeline.layout.extents import size_remarks, with_sizes
 from pipeline.layout.plan import Plan, check_space, make_plan
+from pipeline.runs.methods import compile_kernel, decided
 from pipeline.runs.noise import check_steps, warn_of_steps
-from pipeline.runs.progress import Progress, duration
+from pipeline.runs.progress import Progress
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
@@ -115,9 +116,9 @@ def run(
 
 
 def prepare(spec: Spec, files: Files) -> Plan:
-    """Check what a specification computes, and plan it with the sizes of its states.
+    """Check what a specification computes, and plan it with the sizes of its states and its method.
 
-    The sizes are those that the run in the directory keeps, if there is one.
+    They are those that the run in the directory keeps, if there is one. Else the method may be undecided.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def prepare(spec: Spec, files: Files) -> Plan:
         kept = read_run(files).parsed_spec() if is_run(files) else None
     except (DamagedError, RefusedError, OSError):
         kept = None
-    plan = make_plan(with_sizes(spec, kept), spec.text)
+    plan = make_plan(with_sizes(spec, kept).keeping_method(kept), spec.text)
     check_steps(plan)
     return plan
 
@@ -172,13 +173,14 @@ def carry_out_all(works: Sequence[Work], *, workers: int | None, where: Where, e
     """Compute the missing tasks of several runs, as `carry_out` does for one; the workers share the tasks of all."""
     from pipeline.compute import clients
 
+    works = [work._replace(plan=decided(work.plan, echo)) for work in works]
     new = [work for work in works if check(work.files, work.plan.identity) is None]
     for work in new:
         check_space(work.plan, work.files.local)
     if new:
         clients.reach(where)  # before anything is created
     for work in new:
-        _compile(work.plan, echo)
+        compile_kernel(work.plan, echo)
     with stoppable(works[0].files.name), contextlib.ExitStack() as locks:
         opened = []
         for work in works:
@@ -272,7 +274,7 @@ def _complete(opened: Sequence[_Opened], workers: int | None, where: Where, echo
         echo(line)
     clients.reach(where)
     for run in runs:
-        _compile(run.plan, echo)
+        compile_kernel(run.plan, echo)
     tasks = _Tasks(runs)
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(tasks.missing)))
@@ -297,12 +299,3 @@ def _complete(opened: Sequence[_Opened], workers: int | None, where: Where, echo
                 progress.add(result["cells"])
     for run in runs:
         require_all(run.info, echo)
-
-
-def _compile(plan: Plan, echo: Echo) -> None:
-    """Compile what a run needs, which also checks its model; do nothing for what is compiled already."""
-    from pipeline.compute import task
-
-    seconds = task.warm_up(plan)
-    if seconds > 1:
-        echo(f"kernel compiled in {duration(seconds)}")

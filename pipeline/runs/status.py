@@ -13,6 +13,7 @@ from magpend_core.status import Status
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
+from pipeline.specification.tables import EXPLICIT
 from pipeline.store.files import Files
 from pipeline.store.run import RunDirectory
 
@@ -54,14 +55,16 @@ def describe_state(found: State) -> list[str]:
         f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
         f"{len(found.commits)} of {plan.n_tasks} tasks",
     ]
-    lines += _status_lines(found.cells, plan.n_cells - found.n_committed)
+    method = found.spec.integration.method
+    lines += [f"method: {method}"] * (method != EXPLICIT)
+    lines += _status_lines(found.cells, plan.n_cells - found.n_committed, method)
     return lines + (small_states(found.parameters, found.cube) if found.complete else [])
 
 
-def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:
+def _status_lines(cells: Mapping[str, int], pending: int, method: str) -> list[str]:
     numbers = {**cells, "pending": pending}
     return [
-        f"  {s.name.lower():15s} {numbers[s.name.lower()]:>10d}  {s.advice}"
+        f"  {s.name.lower():15s} {numbers[s.name.lower()]:>10d}  {s.advice_for(method)}"
         for s in Status
         if numbers.get(s.name.lower())
     ]
@@ -153,8 +156,10 @@ def warning(run: RunDirectory) -> str:
     n_lost = sum(o.n_cells for o in lost)
     if n_lost <= WORTH_A_WARNING * computed:
         return ""
+    method = run.spec.integration.method
     told = "; ".join(
-        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.advice}" for o in lost
+        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.advice_for(method)}"
+        for o in lost
     )
     return (
         f"warning: {n_lost} of {computed} cells ({100 * n_lost / computed:.1f} %) diverged or failed; "

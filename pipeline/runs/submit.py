@@ -113,7 +113,7 @@ def prepare(
             "digits, and . _ - + , : = @."
         )
     found = preview(path, directory, smoke=smoke)
-    work = measure(found.plan, found.done)
+    work = measure(found.decided, found.done)
     table, reasons = complete(choice.table, work)
     described = cluster_of(table)
     file = choice.file or folder / TABLE

@@ -27,9 +27,12 @@ from pipeline.specification.recorded_drive import HOW, DriveTable, recorded, run
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, STATES, Starts, refine_problems, starts_model, state_below
 from pipeline.specification.tables import (
+    AUTO,
+    EXPLICIT,
     FREQUENCY,
     RANGES,
     RATES,
+    STIFF,
     Continuation,
     Execution,
     Integration,
@@ -363,7 +366,8 @@ def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
     given = data.get("integration", {})
     # a stored specification has all keys, with their defaults
     fields = Integration.model_fields
-    steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if given.get(k, d := fields[k].default) != d]
+    steps = [k for k in ("rtol", "atol", "max_steps_per_period") if given.get(k, d := fields[k].default) != d]
+    steps += ["method"] * (given.get("method", AUTO) not in (AUTO, EXPLICIT))
     problems += [f"integration.{key}: {what}, whose iterations have no steps; drop the key." for key in steps]
     between = [name for name, product in CELL_PRODUCTS.items() if product.follows_motion]
     for name in (n for n in between if n in data.get("products", {})):
@@ -375,7 +379,7 @@ def _method_problems(integration: Integration | None, products: Mapping[str, Opt
     """Return the problems of `integration.method`: products that interpolate within steps need the method of order
     5.
     """
-    if integration is None or integration.method == "dopri5":
+    if integration is None or integration.method in (AUTO, EXPLICIT, STIFF):
         return []
     inside = [f"products.{n} looks" for n, o in products.items() if CELL_PRODUCTS[n].watches(o)]
     inside += ["a recorded drive has edges"] * is_recorded

@@ -48,7 +48,10 @@ from pipeline.specification.section import SectionTable, seen_through
 from pipeline.specification.starts import STATES, GridStarts, Starts
 from pipeline.specification.table_methods import TableMethod, knows_its_keys
 from pipeline.specification.tables import (
+    AUTO,
+    EXPLICIT,
     FREQUENCY,
+    STIFF,
     Continuation,
     Execution,
     Integration,
@@ -494,6 +497,16 @@ class Spec:
         made = self._of(self.tables, self._folder)
         made.__dict__["_checked"] = {**self._checked, **tables}
         return made
+
+    def by_method(self, method: str) -> Self:
+        """Return the specification with the method that is decided for its run; the written tables stay."""
+        return self.replace(integration=self.integration.model_copy(update={"method": method}))
+
+    def keeping_method(self, kept: Spec | None) -> Self:
+        """Return the specification, if it chooses no method, with the one decided for the run that keeps `kept`."""
+        decided = None if kept is None else kept.integration.method
+        is_open = self.integration.method == AUTO and decided in (EXPLICIT, STIFF)
+        return self.by_method(decided) if is_open and decided else self
 
     # ---- checks and changes ------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
@@ -228,6 +228,16 @@ class Continuation(Table):
         return ("up", "down") if self.direction == "both" else (self.direction,)
 
 
+AUTO: Final = "auto"
+"""Method of a specification until one is decided for its run, see `pipeline.runs.methods`."""
+
+EXPLICIT: Final = "dopri5"
+"""Method of a run that is not stiff, and of what is integrated without a run."""
+
+STIFF: Final = "rodas5p"
+"""Method of a run that is stiff."""
+
+
 class Integration(Table):
     """The table ``[integration]``: tolerances, length of the transient, and section points kept for each trajectory."""
 
@@ -239,9 +249,10 @@ class Integration(Table):
         description="Absolute tolerance of a step, in the states' units; or in units of the sizes "
         "that the motion gave them.",
     )
-    method: Literal["dopri5", "dop853"] = Field(
-        default="dopri5",
-        description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations.",
+    method: Literal["auto", "dopri5", "dop853", "rodas5p"] = Field(
+        default=AUTO,
+        description="Runge-Kutta method: dopri5 of order 5, dop853 of order 8 for smooth equations, or rodas5p for "
+        "stiff ones; auto decides between dopri5 and rodas5p before the run begins.",
     )
     n_transient: int = Field(
         default=300, ge=0, le=100_000_000, description="Drive periods or returns before sections are kept."

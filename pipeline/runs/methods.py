@@ -1,0 +1,189 @@
+"""Decide the method of a run for which none is chosen, before it begins.
+
+Where accuracy limits the steps of an explicit method of order 5, a tolerance that is 1000 times as large leaves a
+quarter of them; where stability limits them, nearly all. A few cells of the run are therefore integrated for a few
+periods at both tolerances, with the code that the run needs anyway. Their counts give the steps that accuracy asks
+for, about as many as a stiff method needs. Only if these would cost less than the explicit steps, the stiff method is
+compiled, and its steps are counted, too.
+
+Counts of steps have the same bits everywhere, so that no decision depends on the machine, on threads or on tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magpend_core.defaults import MOST_STEPS
+from magpend_core.status import Status
+from pipeline.layout.plan import Plan
+from pipeline.motion.steady import Inputs
+from pipeline.runs.progress import duration
+from pipeline.specification.spec import Spec
+from pipeline.specification.tables import EXPLICIT, STIFF
+
+PROBED_CELLS, PROBED_PERIODS = 8, 4
+"""Most cells that are integrated for a decision, and most of their periods."""
+
+LOOSER, LOOSEST = 1e3, 1e-2
+"""Factor between the two tolerances, and the largest one; if it is exceeded, the second one is smaller instead."""
+
+ORDER_OF_EXPLICIT = 5
+"""Order of the explicit method: its steps are in proportion to the root of this order of 1/tolerance."""
+
+LEAST_STEPS = 4
+"""Steps that a stiff method takes in a period at any tolerance."""
+
+CHEAPER_BY = 1.5
+"""Factor by which the stiff method must be cheaper, since estimates are rough."""
+
+SHARES = (0.2, 0.4, 0.6, 0.8)
+"""Parts of a period's steps after which the states are looked at."""
+
+LEAST_RADIUS = 1.0
+"""Mean step times spectral radius below which stability does not limit the steps: at the limit it is above 3."""
+
+
+def cost_of_stiff_step(n_states: int) -> float:
+    """Return the time of an attempted step of the stiff method, in attempted steps of the explicit one.
+
+    Measured on rings of van der Pol oscillators: 1.6 to 4.6 for 2 and 4 states, 2.7 to 5.5 for 8, 4 to 6 for 16, 8 to
+    20 for 32, 9 to 33 for 64, the more the denser the Jacobian is.
+    """
+    return 2.0 + n_states / 4.0
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The method that is decided for a run, and why."""
+
+    method: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Count:
+    """Steps of some cells, shape (cell,)."""
+
+    attempts: np.ndarray  # attempted steps
+    periods: np.ndarray  # periods that are complete
+    seconds: np.ndarray  # their time [s]
+    status: np.ndarray
+    last: np.ndarray  # last states, shape (cell, state)
+
+    @property
+    def is_known(self) -> np.ndarray:
+        """Mask of the cells that tell: those that went on to the end, or to the limit of steps."""
+        return np.isin(self.status, (Status.PERIODIC, Status.BOUNDED, Status.STEP_LIMIT, Status.NO_RETURN))
+
+    @property
+    def is_limited(self) -> np.ndarray:
+        """Mask of the cells that met the limit of steps."""
+        return np.asarray(self.status == Status.STEP_LIMIT)
+
+    def take(self, cells: np.ndarray) -> _Count:
+        """Return the counts of selected cells."""
+        return _Count(*(values[cells] for values in vars(self).values()))
+
+
+def decided(plan: Plan, echo: Callable[[str], None]) -> Plan:
+    """Return the plan with the method of its run. Where that is not chosen it is decided, and told by `echo`."""
+    if not plan.undecided:
+        return plan
+    compile_kernel(plan, echo)
+    found = decide(plan, echo)
+    echo(f"method: {found.method} (auto: {found.reason})")
+    return replace(plan, spec=plan.spec.by_method(found.method), undecided=False)
+
+
+def compile_kernel(plan: Plan, echo: Callable[[str], None]) -> None:
+    """Compile what a run needs, which also checks its model; do nothing for what is compiled already."""
+    from pipeline.compute import task
+
+    seconds = task.warm_up(plan)
+    if seconds > 1:
+        echo(f"kernel compiled in {duration(seconds)}")
+
+
+def decide(plan: Plan, echo: Callable[[str], None]) -> Decision:
+    """Decide the method of a run from cells that are spread over it. If the stiff one is compiled, `echo` tells it."""
+    spec, inputs = plan.spec, plan.cells.spread(PROBED_CELLS)
+    factor = LOOSER if max(spec.integration.rtol, spec.integration.atol) * LOOSER <= LOOSEST else 1.0 / LOOSER
+    exact, other = _count(spec, inputs), _count(spec, inputs, factor)
+    known = exact.is_known & other.is_known
+    if not known.any():
+        return Decision(EXPLICIT, "no cell tells how long its steps can be")
+    exact, other, inputs = exact.take(known), other.take(known), inputs.take(known)
+    cost = CHEAPER_BY * cost_of_stiff_step(len(spec.model.states))
+    by_accuracy = _by_accuracy(exact, other, factor) + LEAST_STEPS * (exact.periods + 1)
+    if exact.attempts.sum() <= cost * by_accuracy.sum() or not _at_stability_limit(spec, inputs, exact):
+        return Decision(EXPLICIT, "accuracy limits its steps")
+    plan = replace(plan, spec=spec.by_method(STIFF))
+    try:
+        compile_kernel(plan, echo)
+    except ValueError as error:
+        return Decision(EXPLICIT, f"{STIFF} does not suit: {error}")
+    return _cheaper(exact, _count(plan.spec, inputs), cost)
+
+
+def _cheaper(explicit: _Count, stiff: _Count, cost: float) -> Decision:
+    """Decide between the methods by the steps that they take for the same cells."""
+    if (stiff.is_limited & ~explicit.is_limited).any() or not stiff.is_known.all():
+        return Decision(EXPLICIT, f"{STIFF} loses cells")
+    many, few = int(explicit.attempts.sum()), int(stiff.attempts.sum())
+    more = "more than " if explicit.is_limited.any() else ""
+    is_stiff = many > cost * few or bool((explicit.is_limited & ~stiff.is_limited).any())
+    method = STIFF if is_stiff else EXPLICIT
+    return Decision(method, f"{few} steps of {STIFF} do what takes {more}{many} of {EXPLICIT}")
+
+
+def _count(spec: Spec, inputs: Inputs, scale: float = 1.0, limit: int = MOST_STEPS) -> _Count:
+    """Integrate cells for some periods at a scaled tolerance, and count their steps."""
+    from pipeline.compute.integrate import watched_quantities
+
+    own = spec.integration
+    n = min(PROBED_PERIODS, own.n_transient + own.n_keep)
+    never = 1e-300  # a tolerance that no orbit meets
+    changed = {
+        "n_transient": 0,
+        "n_keep": n,
+        "rtol": max(own.rtol * scale, 1e-13),
+        "atol": own.atol * scale,
+        "max_steps_per_period": min(own.max_steps_per_period, limit),
+        "closure_tolerance": never,
+    }
+    spec = spec.replace(integration=own.model_copy(update=changed))
+    cells, _ = spec.motion.integrate(inputs, watched_quantities(spec))
+    periods = cells.n_periods[:, 0]
+    seconds = periods / inputs.frequency_hz[:, 0]
+    if cells.return_time is not None:
+        returned = np.nansum(cells.return_time[:, 0], axis=1)
+        seconds = np.where(cells.status[:, 0] == Status.NO_RETURN, returned + 1.0 / inputs.frequency_hz[:, 0], returned)
+    attempts = (cells.n_steps + cells.n_rejected)[:, 0].astype(np.int64)
+    return _Count(attempts, periods, seconds, cells.status[:, 0], cells.final_state[:, 0])
+
+
+def _by_accuracy(exact: _Count, other: _Count, factor: float) -> np.ndarray:
+    """Return the steps of each cell that accuracy asks for: those that change with the tolerance by its law."""
+    changed = (exact.attempts - other.attempts) / (1.0 - factor ** (-1.0 / ORDER_OF_EXPLICIT))
+    return np.asarray(np.maximum(changed, 0.0))
+
+
+def _at_stability_limit(spec: Spec, inputs: Inputs, exact: _Count) -> bool:
+    """Return whether steps are as long as the spectral radius of the Jacobian lets an explicit method take.
+
+    It tells them from the short steps at edges, layers and impacts, which do not change with the tolerance either.
+    """
+    from magpend_core.stiffness import spectral_radii
+
+    system = spec.motion.system
+    if system.jacobian is None or exact.is_limited.any():
+        return True
+    longest = (exact.attempts / np.maximum(exact.periods, 1)).max()
+    radii = []
+    for share in SHARES:
+        states = _count(spec, inputs, limit=max(1, int(share * longest))).last
+        radii.append(spectral_radii(system, inputs.parameters[:, 0], inputs.frequency_hz[:, 0], states))
+    return bool((np.mean(radii, axis=0) * exact.seconds / exact.attempts).max() > LEAST_RADIUS)
