@@ -11,8 +11,8 @@ import importlib
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -208,6 +208,8 @@ class Model:
         How it counts time: by periods of a drive, at even times, by returns, or by iterations.
     text : mapping, optional
         The table that the model was read from, if it was text; plain data, see `reference`.
+    method : str
+        By which its system is integrated, see `System.method`.
     """
 
     name: str
@@ -227,6 +229,7 @@ class Model:
     relations: Callable[[Mapping[str, float]], list[str]] = field(default=_no_relations)
     clock: Clock = DRIVEN
     text: Mapping[str, Any] | None = None
+    method: str = "dopri5"
 
     def __repr__(self) -> str:
         states = ", ".join(f"{s.name} [{s.unit}]" for s in self.states)
@@ -323,7 +326,7 @@ class Model:
         """Return the system that the engine integrates; imports the compiler."""
         module, _, attribute = self.system_path.partition(":")
         found: System = getattr(importlib.import_module(module), attribute)
-        return found
+        return found if found.method == self.method else replace(found, method=self.method)
 
     @cached_property
     def digest(self) -> str:
@@ -491,3 +494,14 @@ class Parameters(Mapping[str, float]):
             See the class.
         """
         return type(self)(self.model, {**self._values, **overrides})
+
+
+@cache
+def by_method(model: Model, method: str) -> Model:
+    """Return a model whose system is integrated by a method; equal arguments give the same object."""
+    if method == model.method:
+        return model
+    made = replace(model, method=method)
+    # what was derived from a text does not depend on it
+    made.__dict__.update({key: value for key, value in vars(model).items() if key not in (*vars(made), "system")})
+    return made

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -88,7 +88,7 @@ class TextModel(Model):
         """Return the system that the engine integrates; imports the compiler."""
         from magpend_core.models.text.compiled import system_of
 
-        return system_of(self.definition, self.derived, self.source)
+        return replace(system_of(self.definition, self.derived, self.source), method=self.method)
 
 
 def model_of(definition: Definition, shipped: bool = False) -> TextModel:

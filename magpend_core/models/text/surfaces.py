@@ -56,7 +56,8 @@ def with_surface(model: TextModel, of: str) -> TextModel:
     looked = _Looked(own, tree, _drawn(own))
     if (problem := looked.problem) is not None:
         raise ParameterError([f"{PLACE} = {of!r}: {problem}"])
-    return model_of(replace(own, surface=tree, surface_unit=looked.unit), model.shipped)
+    expressed = model_of(replace(own, surface=tree, surface_unit=looked.unit), model.shipped)
+    return replace(expressed, method=model.method)
 
 
 def keeps_surface(model: TextModel, mirror: Mirror) -> bool:
