@@ -5,6 +5,7 @@ Run from the repository's root, on a machine that does nothing else::
     python tests/bench/peers.py                                # all models: some ten minutes
     python tests/bench/peers.py --models belt pendulum --peers scalar heyoka --points
     python tests/bench/peers.py --figure work_precision.png    # error against time, too
+    python tests/bench/peers.py --stiff                        # stiff problems, beside solvers of these
 
 Every shipped text, and the paper's pendulum with its magnets and with steep edges of the drive, beside
 
@@ -20,8 +21,19 @@ is no drive a period is a while. Where all settings of a solver are better than 
 equations of the peers are made from a text's expressions with parameters as numbers (`solvers`); magpend's parameters
 are read per lane. The pendulum with magnets is functions by hand in magpend, and compared with its text first.
 
-Models whose motion sticks or jumps (belt-stick, impact) have no peer: none of them says what comes after. heyoka and
-numbalsoda are the dependency group ``bench``; a missing one is reported and left out.
+Models whose motion sticks or jumps (belt-stick, impact) have no peer: none of them says what comes after.
+
+With ``--stiff``, ensembles of HIRES, ROBER, the Oregonator, Hodgkin and Huxley's axon and van der Pol's oscillator at
+mu = 1000 run from start to end beside
+
+* numbalsoda: LSODA;
+* SUNDIALS: CVODE's BDF from the wheel of scikit-sundae, called from compiled code, with the exact Jacobian;
+* diffrax: Kvaerno's method of order 5, all trajectories at once (``vmap``, ``jit``, time of compilation left out);
+* scipy: `solve_ivp` with LSODA and Radau on the compiled right-hand side and Jacobian.
+
+Errors are those at the end, against scipy's Radau at 1e-11; a period is a run from start to end.
+
+All peers are the dependency group ``bench``; a missing one is reported and left out.
 """
 
 from __future__ import annotations
@@ -36,14 +48,16 @@ from typing import Any
 
 import numpy as np
 import solvers
-from racing import HEAD, Contestant, Curve, Runner, decades, points, race, ratios, scaled_error
+import stiff
+from racing import HEAD, Contestant, Curve, Runner, decades, lanes, points, race, ratios, scaled_error
 
-from magpend_core import load_model, pointwise, run_branches
+from magpend_core import load_model, pointwise
 from magpend_core.engine.system import System
-from magpend_core.engine.tableau import METHODS
+from magpend_core.engine.threads import using_threads
 from magpend_core.models.text import read_model
 
 N_ERROR = 16
+METHODS = ("dopri5", "dop853")
 PEERS = ("scalar", "numbalsoda", "heyoka", "scipy")
 TURN = 2.0 * math.pi
 
@@ -128,29 +142,6 @@ def text_of(name: str) -> Any:
             "equations": table["equations"],
         }
     )
-
-
-def lanes(system: System, packed: np.ndarray, frequency: float, tolerance: float, on_steps: Any = None) -> Runner:
-    """Runner of the engine."""
-
-    def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
-        n = len(initial)
-        found = run_branches(
-            np.tile(packed, (n, 1, 1)),
-            np.full((n, 1), frequency),
-            initial,
-            n_transient=n_periods - 1,
-            n_keep=1,
-            rtol=tolerance,
-            atol=tolerance,
-            system=system,
-            max_steps_per_period=1_000_000,
-        )
-        if on_steps is not None:
-            on_steps(found)
-        return found.section[:, 0, 0]
-
-    return runner
 
 
 def engine_entry(
@@ -244,7 +235,7 @@ def compare(name: str, peers: Sequence[str], size: tuple[int, int], rounds: int)
     system, rhs = parameters.model.system, rhs_of(text, case)
     same = check_equations(parameters, rhs, case)
     error_of = error_by(rhs, case, system)
-    engine = engine_entry("magpend", system, parameters.pack(), case, size, tuple(METHODS))
+    engine = engine_entry("magpend", system, parameters.pack(), case, size, METHODS)
     agreed = error_of(engine.settings["dopri5 1e-11"])
     entries = [engine, *peer_entries(text, case, peers, *size)]
     curves = race(entries, case.starts(size[0]), error_of, rounds)
@@ -278,16 +269,24 @@ def draw(results: Mapping[str, list[Curve]], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--models", nargs="+", choices=list(CASES), default=list(CASES))
-    p.add_argument("--peers", nargs="*", choices=PEERS, default=list(PEERS))
+    p.add_argument("--stiff", action="store_true", help="stiff problems and solvers of them")
+    p.add_argument("--models", nargs="+", choices=[*CASES, *stiff.SPREAD], help="all")
+    p.add_argument("--peers", nargs="*", choices=[*PEERS, *stiff.PEERS[1:3]], help="all")
     p.add_argument("--trajectories", type=int, default=128, help="a multiple of 8 (128)")
     p.add_argument("--periods", type=int, default=100, help="periods that are timed (100)")
     p.add_argument("--rounds", type=int, default=3)
     p.add_argument("--points", action="store_true", help="print every measured point")
     p.add_argument("--figure", type=Path, help="PNG, PDF or SVG of error against time")
     options = p.parse_args(arguments)
-    peers, size = installed(options.peers), (options.trajectories, options.periods)
-    results = {name: compare(name, peers, size, options.rounds) for name in options.models}
+    models, peers = (stiff.SPREAD, stiff.PEERS) if options.stiff else (CASES, PEERS)
+    peers, size = installed(peers if options.peers is None else options.peers), (options.trajectories, options.periods)
+    with using_threads(1):
+        results = {
+            name: stiff.compare(name, peers, size[0], options.rounds)
+            if options.stiff
+            else compare(name, peers, size, options.rounds)
+            for name in options.models or models
+        }
     if options.points:
         for name, curves in results.items():
             print(f"\n{name}", *points(curves), sep="\n")

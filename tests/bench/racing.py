@@ -10,6 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core import run_branches
+from magpend_core.engine.system import System
+
 ERRORS = (1e-4, 1e-6, 1e-8)
 """Median errors at which solvers are compared."""
 
@@ -46,6 +49,29 @@ def deeper(function: Callable[[], None], depth: int) -> None:
         function()
     else:
         next(map(lambda _: deeper(function, depth - 1), (0,)))
+
+
+def lanes(system: System, packed: np.ndarray, frequency: float, tolerance: float, on_steps: Any = None) -> Runner:
+    """Runner of the engine."""
+
+    def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
+        n = len(initial)
+        found = run_branches(
+            np.tile(packed, (n, 1, 1)),
+            np.full((n, 1), frequency),
+            initial,
+            n_transient=n_periods - 1,
+            n_keep=1,
+            rtol=tolerance,
+            atol=tolerance,
+            system=system,
+            max_steps_per_period=1_000_000,
+        )
+        if on_steps is not None:
+            on_steps(found)
+        return found.section[:, 0, 0]
+
+    return runner
 
 
 def decades(first: float, last: float, per_decade: int) -> list[float]:
@@ -96,7 +122,11 @@ class Curve:
 
 
 def race(
-    contestants: Sequence[Contestant], initial: np.ndarray, error_of: Callable[[Runner], float], rounds: int
+    contestants: Sequence[Contestant],
+    initial: np.ndarray,
+    error_of: Callable[[Runner], float],
+    rounds: int,
+    clock: Callable[[], float] = time.thread_time,
 ) -> list[Curve]:
     """Take the errors of all settings, which also compiles everything, then their least costs; all take turns."""
     errors = {(c.name, name): error_of(runner) for c in contestants for name, runner in c.settings.items()}
@@ -105,7 +135,7 @@ def race(
         for c in contestants
         for name, runner in c.settings.items()
     }
-    costs = {key: 1e6 * seconds for key, (seconds, _) in least(runs, rounds).items()}
+    costs = {key: 1e6 * seconds for key, (seconds, _) in least(runs, rounds, clock).items()}
     return [
         Curve(
             c.name,

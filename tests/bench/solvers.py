@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -61,12 +61,13 @@ def _python(tree: Tree) -> str:
     return f"({sign.join(args)})"
 
 
-def scalar_rhs(model: TextModel, values: Mapping[str, float], frequency: float) -> Any:
-    """Compiled ``rhs(t, *states)`` -> rates as a tuple."""
+def rhs_source(model: TextModel, values: Mapping[str, float], frequency: float, sizes: Sequence[float] = ()) -> str:
+    """Source of ``rhs(t, *states)`` -> rates as a tuple, of states in units of their sizes if these are given."""
     definition = model.definition
     states = [s.name for s in model.states]
     known = {**{name: repr(float(v)) for name, v in values.items()}, "pi": repr(math.pi), "f": repr(frequency)}
     lines = [f"def rhs(t, {', '.join(states)}):"]
+    lines += [f"    {name} = {name} * {size!r}" for name, size in zip(states, sizes, strict=False)]
     for name in definition.used(definition.equations.values()):
         if name == "phase":
             lines.append(f"    phase = t * {frequency!r}")
@@ -74,9 +75,15 @@ def scalar_rhs(model: TextModel, values: Mapping[str, float], frequency: float) 
             lines.append(f"    {name} = {_python(definition.define[name])}")
         elif name in known:
             lines.append(f"    {name} = {known[name]}")
-    lines.append(f"    return ({', '.join(_python(tree) for tree in definition.equations.values())},)")
+    rates = [_python(tree) for tree in definition.equations.values()]
+    rates = [f"({rate}) / {size!r}" for rate, size in zip(rates, sizes, strict=True)] if sizes else rates
+    return "\n".join([*lines, f"    return ({', '.join(rates)},)"])
+
+
+def scalar_rhs(model: TextModel, values: Mapping[str, float], frequency: float, sizes: Sequence[float] = ()) -> Any:
+    """Compiled ``rhs(t, *states)`` -> rates as a tuple."""
     scope: dict[str, Any] = {"math": math, "_sign": _sign, "_square": _square}
-    exec("\n".join(lines), scope)
+    exec(rhs_source(model, values, frequency, sizes), scope)
     return njit(forceinline=True, **_OPTIONS)(scope["rhs"])
 
 
@@ -168,7 +175,7 @@ def scipy_runner(rhs: Any, period: float, tolerance: float, method: str) -> Runn
     """Runner with scipy's `solve_ivp`, which shares nothing with the engine."""
     from scipy.integrate import solve_ivp
 
-    function = _array_function(rhs)
+    function = array_function(rhs)
 
     def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
         options = {"method": method, "rtol": tolerance, "atol": tolerance}
@@ -179,10 +186,10 @@ def scipy_runner(rhs: Any, period: float, tolerance: float, method: str) -> Runn
 
 
 @cache
-def _array_function(rhs: Any) -> Any:
+def array_function(rhs: Any) -> Any:
     """Compile ``function(t, y)`` -> array, once for all tolerances."""
     n = rhs.py_func.__code__.co_argcount - 1
-    fixed = _tuple_of(n)
+    fixed = tuple_of(n)
 
     @njit(error_model="numpy")
     def function(t: float, y: np.ndarray) -> np.ndarray:
@@ -192,7 +199,7 @@ def _array_function(rhs: Any) -> Any:
 
 
 @cache
-def _tuple_of(n: int) -> Any:
+def tuple_of(n: int) -> Any:
     scope: dict[str, Any] = {}
     exec(f"def fixed(y, n): return ({', '.join(f'y[{i}]' for i in range(n))},)", scope)
     return njit(forceinline=True)(scope["fixed"])
@@ -203,7 +210,7 @@ def numbalsoda_loop(rhs: Any, n: int, period: float, method: str) -> Callable[[f
     import numbalsoda
     from numba import carray, cfunc
 
-    fixed = _tuple_of(n)
+    fixed = tuple_of(n)
 
     @cfunc(numbalsoda.lsoda_sig, fastmath=True, error_model="numpy")
     def callback(t: Any, y: Any, out: Any, data: Any) -> None:

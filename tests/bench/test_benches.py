@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parent
-PARTS = {"racing", "solvers"}
+PARTS = {"implicit", "racing", "solvers", "stiff"}
 
 
 def test_benches__can_be_imported_take_options_and_are_listed(monkeypatch, capsys):
