@@ -311,17 +311,30 @@ def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
         store(w, row + ROWS.side, where_less(0.5, crossed, -side, side))
 
 
+def hidden_zero(w: Any, base: int) -> Any:
+    """Return 1 where the earlier attempt passed an event, though a step up to its end has not; else 0."""
+    hidden = 0.0 * load(w, base + ROWS.step)
+    for k in range(N_EVENTS):
+        _, _, b, _ = margin(w, base, k, pair(w, base + ROWS.found, k), pair(w, base + ROWS.passed, k))
+        hidden = maximum(hidden, where_less(b, 0.0, fires(w, base, k), 0.0))
+    return hidden
+
+
 def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
     """Set the length of the next step so that it ends at the nearest zero of the event functions.
 
     If the attempt is taken back (`takes`), the zero lies within its length. If the step ended before the zero
-    (`goes_on`), the zero lies within the rest of an earlier attempt.
+    (`goes_on`), the zero lies within the rest of an earlier attempt. Where nothing is left of an attempt that passed
+    the zero, rounding has hidden it from the shorter steps; then the next attempts keep the resolution.
     """
-    h = load(w, base + ROWS.step)
-    length = where_less(0.5, takes, h, load(w, base + ROWS.ahead) - h)
+    h, ahead = load(w, base + ROWS.step), load(w, base + ROWS.ahead)
+    length = where_less(0.5, takes, h, ahead - h)
     on = maximum(takes, where_less(0.0, length, goes_on, 0.0))
+    ends, kept = where_less(0.0, ahead, goes_on * (1.0 - on), 0.0), 0.0 * h
+    if any_nonzero(ends):
+        kept = ends * hidden_zero(w, base) * narrow
     if not any_nonzero(on):
-        store(w, base + ROWS.resolution, 0.0 * h)
+        store(w, base + ROWS.resolution, kept)
         store(w, base + ROWS.ahead, 0.0 * h)
         store(w, base + ROWS.aimed, 0.0 * h)
         return
@@ -340,7 +353,7 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
         x = where_less(b, 0.0, where_less(0.5, fires(w, base, k), root, dip), dip)
         nearest = minimum(nearest, x * length)
     narrow = WIDEN * narrow
-    store(w, base + ROWS.resolution, where_less(0.5, on, narrow, 0.0 * h))
+    store(w, base + ROWS.resolution, where_less(0.5, on, narrow, kept))
     store(w, base + ROWS.ahead, where_less(0.5, on, length, 0.0 * h))
     # end slightly beyond the zero, so that rounding does not leave the step before it
     store(w, base + ROWS.aimed, where_less(0.5, on, multiply_add(0.125, narrow, nearest), 0.0 * h))
@@ -361,5 +374,5 @@ def section_counts(w: Any, base: int, lane: int) -> bool:
 INLINE = ("cubic_dip", "may_dip", "cubic_root", "margin", "pair", "fires", "section_counts")
 """Templates of this module that are inlined into their callers. Callees come first; `CALLED` follows after them."""
 
-CALLED = ("turn_sides", "aim", "settle_events", "hides_events", "turns_too_far", "judge_events")
+CALLED = ("turn_sides", "hidden_zero", "aim", "settle_events", "hides_events", "turns_too_far", "judge_events")
 """Templates of this module that are compiled as functions of their own."""

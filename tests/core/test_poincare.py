@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from magpend_core import load_model, lyapunov_exponents, sections
+from magpend_core import Status, load_model, lyapunov_exponents, sections
 from magpend_core.crossing import Crossing
 from magpend_core.engine.crossing import with_section, without_section
 from magpend_core.models.parameters import ParameterError
@@ -181,6 +181,22 @@ def test_run_branches__two_crossings_within_a_step():
 
 
 @pytest.mark.slow
+def test_section_map__crossings_that_rounding_hides():
+    """About a centre far from 0 the steps onto a surface are lost in the states' last digits; each of 256 starts on a
+    cycle returns all the same, after its period.
+    """
+    far = table(
+        "far", {"x": "u - v - u*r", "y": "u + v - v*r"}, {}, define={"u": "x - 20", "v": "y - 20", "r": "u**2 + v**2"}
+    )
+    parameters = seen(far, "0.003*u - 0.26*v", longest=20.0)
+    system, angles = parameters.model.system, np.linspace(0.02, 3.0, 256)
+    starts = np.column_stack([20.0 + np.cos(angles), 20.0 + np.sin(angles)])
+    packed = np.tile(parameters.pack(), (len(starts), 1))
+    found = section_map(packed, np.full(len(starts), 0.05), starts, 2, rtol=1e-12, system=system)
+    assert (found.status == Status.BOUNDED).all()
+    np.testing.assert_allclose(found.times[:, 1], 2.0 * np.pi, rtol=1e-4)
+
+
 def test_lyapunov_exponents__rossler():
     found = []
     for of in ("x", "x + 0.5*y"):
