@@ -21,6 +21,7 @@ from magpend_core.status import Status
 from pipeline.layout.plan import Plan
 from pipeline.motion.steady import Inputs
 from pipeline.runs.progress import duration
+from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import EXPLICIT, STIFF
 
@@ -98,6 +99,22 @@ def decided(plan: Plan, echo: Callable[[str], None]) -> Plan:
     return replace(plan, spec=plan.spec.by_method(found.method), undecided=False)
 
 
+def check_method(spec: Spec) -> None:
+    """Refuse the stiff method for a system that it cannot integrate.
+
+    Raises
+    ------
+    SpecError
+        With the reason.
+    """
+    if spec.integration.method != STIFF:
+        return
+    from magpend_core.engine.symbolic import implicit_problem
+
+    if problem := implicit_problem(spec.motion.system):
+        raise SpecError(f'integration.method = "{STIFF}": {problem}')
+
+
 def compile_kernel(plan: Plan, echo: Callable[[str], None]) -> None:
     """Compile what a run needs, which also checks its model; do nothing for what is compiled already."""
     from pipeline.compute import task
@@ -124,7 +141,7 @@ def decide(plan: Plan, echo: Callable[[str], None]) -> Decision:
     try:
         compile_kernel(plan, echo)
     except ValueError as error:
-        return Decision(EXPLICIT, f"{STIFF} does not suit: {error}")
+        return Decision(EXPLICIT, f"{STIFF} does not suit: {str(error).rstrip('.')}")
     return _cheaper(exact, _count(plan.spec, inputs), cost)
 
 

@@ -18,7 +18,7 @@ from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.evaluation import check_starts
 from pipeline.layout.extents import size_remarks, with_sizes
 from pipeline.layout.plan import Plan, check_space, make_plan
-from pipeline.runs.methods import compile_kernel, decided
+from pipeline.runs.methods import check_method, compile_kernel, decided
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress
 from pipeline.runs.stopping import InterruptedRunError, stoppable
@@ -123,7 +123,8 @@ def prepare(spec: Spec, files: Files) -> Plan:
     Raises
     ------
     SpecError
-        If the equations have no value at the starts, if steps of noise are too long, or if the run is too large.
+        If the equations have no value at the starts, if steps of noise are too long, if the chosen method does not suit
+        the system, or if the run is too large.
     """
     check_starts(spec)
     try:
@@ -132,6 +133,7 @@ def prepare(spec: Spec, files: Files) -> Plan:
         kept = None
     plan = make_plan(with_sizes(spec, kept).keeping_method(kept), spec.text)
     check_steps(plan)
+    check_method(plan.spec)
     return plan
 
 

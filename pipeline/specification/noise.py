@@ -13,7 +13,7 @@ from magpend_core.disturbance import Disturbance
 from magpend_core.models.noisy import noisy
 from magpend_core.models.parameters import ParameterError
 from magpend_core.sizes import NOISE_PREFIX, REALIZATION
-from pipeline.specification.tables import Table
+from pipeline.specification.tables import STIFF, Table
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
@@ -143,6 +143,8 @@ def _clashes(data: Mapping[str, Any]) -> list[str]:
         problems.append("initial_conditions.refine: noisy cells do not close, so none can be inferred; drop the key.")
     if data.get("integration", {}).get("stop_when_closed"):
         problems.append("integration.stop_when_closed: noisy cells do not close; drop the key.")
+    if data.get("integration", {}).get("method") == STIFF:
+        problems.append(f'integration.method = "{STIFF}": noise is integrated by a method of its own; drop the key.')
     products = data.get("products", {})
     return problems + [
         f"products.{n}: is defined for runs without noise; drop the product, or [noise]." for n in products

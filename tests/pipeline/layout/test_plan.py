@@ -141,6 +141,17 @@ def test_inputs__sweep_cell_by_cell(sweep_text):
         assert inputs.initial_states[row].tolist() == start
 
 
+def test_spread__takes_cells_from_the_first_to_the_last(sweep_text):
+    cells = CellMap(Spec.parse(tomllib.loads(sweep_text)))
+    found, every = cells.spread(5), cells.inputs(whole(cells.shape))
+    rows = [0, *(np.arange(1, 4) * (np.prod(cells.shape) - 1) // 4), -1]
+    assert (found.initial_states == every.initial_states[rows]).all()
+    assert (found.frequency_hz == every.frequency_hz[rows]).all()
+    one = {"kind": "sweep", "model": "duffing", "parameters": {"frequency_hz": 0.2}, "initial_conditions": {"x": 0.1}}
+    one["initial_conditions"]["kind"] = "grid"
+    assert CellMap(Spec.parse(one)).spread(5).initial_states.tolist() == [[0.1, 0.0]]
+
+
 def test_inputs__branches_walk_up_and_down(walk_text):
     spec = Spec.parse(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
     cells = CellMap(spec)

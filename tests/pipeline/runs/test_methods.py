@@ -11,6 +11,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.runs import methods
 from pipeline.runs.methods import Decision, decide, decided
 from pipeline.runs.run import prepare, run
+from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.store.objects import open_files
 from pipeline.store.runfile import read_run
@@ -130,6 +131,22 @@ def test_prepare__takes_the_method_that_was_decided_for_the_run_in_the_directory
     assert prepare(relaxed(10.0, method="dopri5"), open_files(tmp_path / "run")).spec.integration.method == "dopri5"
     create(tmp_path / "other", make_plan(relaxed(10.0, method="dop853")))
     assert prepare(spec, open_files(tmp_path / "other")).undecided  # another run, which is refused then
+
+
+def test_prepare__refuses_the_stiff_method_where_it_does_not_suit(tmp_path):
+    many = "\n".join(f"x{i}' = -x{i}" for i in range(65))
+    spec = spec_of(many, [[0.1] * 65], method="rodas5p", parameters={"period": 1.0})
+    with pytest.raises(SpecError, match=r'integration.method = "rodas5p": .* has 65 states; .* at most 64'):
+        prepare(spec, open_files(tmp_path / "run"))
+    with pytest.raises(SpecError, match=r'integration.method = "rodas5p": noise .* drop the key'):
+        relaxed(10.0, method="rodas5p", noise={"strengths": {"x": 0.1}})
+
+
+def test_advice__names_the_method_that_met_the_limit_of_steps_and_the_stiff_one_beside_an_explicit_one():
+    explicit, stiff = (Status.STEP_LIMIT.advice_for(method) for method in ("dopri5", "rodas5p"))
+    assert "more steps of dopri5 than max_steps_per_period; if the equations are stiff, set method" in explicit
+    assert "more steps of rodas5p than max_steps_per_period; raise it" in stiff
+    assert Status.DIVERGED.advice_for("dopri5") == Status.DIVERGED.advice
 
 
 CHEMISTRY = {  # Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.10

@@ -245,11 +245,12 @@ def test_method__of_order_8_gives_the_same_motion_in_fewer_steps():
     assert (3 * eighth["n_steps"] < fifth["n_steps"]).all()
 
 
-def test_method__is_one_of_two_and_order_8_goes_with_nothing_that_looks_into_steps():
+def test_method__is_known_and_order_8_goes_with_nothing_that_looks_into_steps():
     with pytest.raises(SpecError, match=r"integration.method = 'rk4'"):
         spec_of("rk4")
     extremes = {"extremes": {"quantities": ["energy"]}}
-    assert spec_of("dopri5", products=extremes).products
+    for method in ("auto", "dopri5", "rodas5p"):
+        assert spec_of(method, products=extremes).products
     with pytest.raises(SpecError) as caught:
         spec_of("dop853", products=extremes)
     (problem,) = caught.value.problems
