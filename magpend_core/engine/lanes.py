@@ -411,7 +411,9 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
         lands = where_less(absolute(verdict - LANDED), 0.5, 1.0, 0.0)
         in_time = where_less(max_attempts, attempts, event, CROSSED)
         event = where_less(0.5, lands, in_time, event)
-    tiny = 1e-15 * load(w, base + ROWS.period)
+    # of a stiff method the first steps are by far the shortest, where time has all its digits
+    period = load(w, base + ROWS.period)
+    tiny = 1e-15 * (maximum(t_new, 1e-15 * period) if IS_STIFF else period)
     event = where_less(next_wish, tiny, UNDERFLOW, event)
     if REWRITES:
         last = load(w, base + ROWS.state + (N - 1) * WIDTH)
@@ -924,6 +926,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "DENSE": system.tableau.dense,
         "MIDDLE": system.tableau.middle,
         "FIRST_WEIGHED": 2 - system.is_stiff,
+        "IS_STIFF": system.is_stiff,
         **event_bindings(system),
         **mode_bindings(system),
         "NE": system.n_edges,

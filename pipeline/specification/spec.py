@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
 
 from magpend_core.models import load_model
 from magpend_core.models.drift.ramps import Ramp
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Model, Parameters, by_method
 from magpend_core.models.presets import is_file
 from pipeline.motion.drifting import Drifting
 from pipeline.motion.noisy import Noisy
@@ -271,7 +271,9 @@ class Spec:
     @cached_property
     def model(self) -> Model:
         """Model that is integrated, with what the specification adds: a Poincare section, moving parameters, noise."""
-        model = moving.moved(seen_through(load_model(self.reference), self.section), self.ramps, [])
+        method = STIFF if self.integration.method == STIFF else EXPLICIT
+        model = seen_through(by_method(load_model(self.reference), method), self.section)
+        model = moving.moved(model, self.ramps, [])
         return disturbed(model, self.noise)
 
     @cached_property
