@@ -963,6 +963,8 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         for room in reversed(rooms):  # callees come first
             templates = {key: getattr(room, key) for key in (*room.INLINE, *room.CALLED)} | templates
         templates["run_stages"] = rooms[-1].run_stages
+        if system.is_stiff:
+            templates |= rosenbrock.own_templates(bindings)
     elif system.n_states <= UNROLLED_STATES + short and not system.is_map:
         templates["run_stages"] = unrolled_stages(system)
     if system.is_map:

@@ -15,7 +15,7 @@ and dense output are the same for both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +28,7 @@ from magpend_core.engine.simd import (
     any_nonzero,
     load,
     load_rows,
+    maximum,
     multiply_add,
     store,
     store_rows,
@@ -50,6 +51,101 @@ def order_of_states(entries: Sequence[tuple[int, int]], n: int) -> np.ndarray:
 
     same = np.arange(n)
     return position if band(position) < band(same) else same
+
+
+UNROLLED = 10
+"""Most states whose stages and linear systems are computed in registers."""
+
+
+def unrolled_states(n: int) -> Callable[..., None]:
+    """Return `advance_states` for a small system, with its loops over states written out."""
+    last = "w, base + ROWS.slopes + (s - 1) * N * WIDTH"
+    lines = ["def advance_states(w, base, s):", "h = load(w, base + ROWS.step)", "if s > FIRST_ADDED:"]
+    for i in range(n):
+        at = f"w, base + ROWS.trial + {i * WIDTH}"
+        lines.append(f"    store({at}, multiply_add(h, load({last} + {i * WIDTH}), load({at})))")
+    lines += ["else:"]
+    lines += [f"    x{i} = STAGES[s, 1] * load(w, base + ROWS.slopes + N * WIDTH + {i * WIDTH})" for i in range(n)]
+    lines += ["    for j in range(2, s):"]
+    for i in range(n):
+        slope = f"load(w, base + ROWS.slopes + j * N * WIDTH + {i * WIDTH})"
+        lines.append(f"        x{i} = multiply_add(STAGES[s, j], {slope}, x{i})")
+    for i in range(n):
+        state = f"load(w, base + ROWS.state + {i * WIDTH})"
+        lines.append(f"    store(w, base + ROWS.trial + {i * WIDTH}, {state} + h * x{i})")
+    return _made("advance_states", lines)
+
+
+def unrolled_stage(positions: Sequence[int], below: int, behind: int) -> Callable[..., None]:
+    """Return `solve_states` for a small system, with its loops over states written out."""
+    n, at = len(positions), [int(i) for i in np.argsort(positions)]  # the state of each row
+    lines = [
+        "def solve_states(w, base, s):",
+        "rates = base + ROWS.slopes if s == 1 else base + ROWS.slopes + s * N * WIDTH",
+    ]
+    lines += [f"x{j} = load(w, rates + {at[j] * WIDTH})" for j in range(n)]
+    lines += ["for j in range(1, s):", "    slopes = base + ROWS.slopes + j * N * WIDTH"]
+    lines += [f"    x{j} = multiply_add(COUPLINGS[s, j], load(w, slopes + {at[j] * WIDTH}), x{j})" for j in range(n)]
+    lines += ["if IS_TIMED:"]
+    lines += [
+        f"    x{j} = multiply_add(SHIFTS[s], load(w, base + ROWS.drift + {at[j] * WIDTH}), x{j})" for j in range(n)
+    ]
+    lines += [f"x{j} = GAMMA * x{j}" for j in range(n)]
+    lines += ["if any_nonzero(load(w, base + ROWS.exchanges)):"]
+    lines += [f"    {line}" for line in _eliminated(n, below, True)]
+    lines += ["else:", *(f"    {line}" for line in _eliminated(n, below, False) or ["pass"])]
+    for j in range(n)[::-1]:
+        for m in range(j + 1, min(n, j + 1 + behind)):
+            lines.append(f"x{j} = x{j} - load(w, base + ROWS.matrix + {(j * n + m) * WIDTH}) * x{m}")
+        lines.append(f"x{j} = x{j} * load(w, base + ROWS.matrix + {j * (n + 1) * WIDTH})")
+        lines.append(f"store(w, base + ROWS.slopes + s * N * WIDTH + {at[j] * WIDTH}, x{j})")
+    return _made("solve_states", lines)
+
+
+def _eliminated(n: int, below: int, exchanges: bool) -> list[str]:
+    lines = []
+    for j in range(n):
+        rows = range(j + 1, min(n, j + 1 + below))
+        for i in rows if exchanges else ():
+            at = f"base + ROWS.exchanges + {(i * n + j) * WIDTH}"
+            lines += [f"swap = load(w, {at})", f"other = where_less(0.5, swap, x{i}, x{j})"]
+            lines += [f"x{i} = where_less(0.5, swap, x{j}, x{i})", f"x{j} = other"]
+        lines += [f"x{i} = x{i} - load(w, base + ROWS.matrix + {(i * n + j) * WIDTH}) * x{j}" for i in rows]
+    return lines
+
+
+def _made(name: str, lines: list[str]) -> Callable[..., None]:
+    scope: dict[str, Any] = {}
+    exec("\n    ".join(lines), globals(), scope)
+    function: Callable[..., None] = scope[name]
+    return function
+
+
+def unrolled_factors(n: int, below: int, behind: int) -> Callable[..., None]:
+    """Return `factorise` for a small system, with its loops written out."""
+    lines = ["def factorise(w, base):", "store(w, base + ROWS.exchanges, 0.0 * load(w, base + ROWS.step))"]
+    for j in range(n):
+        last, end = min(n, j + 1 + below), min(n, j + 1 + behind)
+        lines += [f"exchange(w, base, {j}, {i}, {end})" for i in range(j + 1, last)]
+        row = f"w, base + ROWS.matrix + {j * n * WIDTH}"
+        lines += [f"inverse = 1.0 / load({row} + {j * WIDTH})", f"store({row} + {j * WIDTH}, inverse)"]
+        lines += [f"p{m} = load({row} + {m * WIDTH})" for m in range(j + 1, end)]
+        for i in range(j + 1, last):
+            other = f"w, base + ROWS.matrix + {i * n * WIDTH}"
+            lines += [f"factor = load({other} + {j * WIDTH}) * inverse", f"store({other} + {j * WIDTH}, factor)"]
+            for m in range(j + 1, end):
+                lines.append(f"store({other} + {m * WIDTH}, load({other} + {m * WIDTH}) - factor * p{m})")
+    return _made("factorise", lines)
+
+
+def _first_added(stages: np.ndarray) -> int:
+    """Return the last stage whose state is not that of the stage before and one more slope."""
+    adds = [
+        s
+        for s in range(1, len(stages))
+        if (stages[s, : s - 1] == stages[s - 1, : s - 1]).all() and stages[s, s - 1] == 1.0
+    ]
+    return max(s for s in range(1, len(stages)) if s not in adds)
 
 
 class _Layout(NamedTuple):
@@ -101,6 +197,7 @@ def implicit_bindings(system: System) -> dict[str, Any]:
     n_bent = n if n_entries(system) else system.n_states - n
     return {
         "GAMMA": implicit.gamma,
+        "FIRST_ADDED": _first_added(system.tableau.stages),
         "COUPLINGS": implicit.couplings,
         "SHIFTS": implicit.shifts,
         "linearise": own.function,
@@ -117,7 +214,6 @@ def implicit_bindings(system: System) -> dict[str, Any]:
         "AT_DRIFTS": (starts[2] - len(own.timed) if starts[2] == starts[3] else len(own.entries)) * WIDTH,
         "AT_BENDING": (starts[2] - len(of_vector.timed)) * WIDTH,
         "AT_LEAVING": (starts[3] - len(of_trace.timed)) * WIDTH,
-        "HAS_CROSS": len(of_vector.entries) > 0,
         "POSITIONS": at,
         "PLACES": np.array([at[i] * n + at[j] for i, j in own.entries] or [0]),
         "BELOW": max(0, *offsets, 0),
@@ -162,6 +258,7 @@ def exchange(w: Any, base: int, j: int, i: int, end: int) -> None:
     swap = where_less(absolute(pivot), absolute(candidate), 1.0, 0.0)
     store(w, base + ROWS.exchanges + (i * N_SOLVED + j) * WIDTH, swap)
     if any_nonzero(swap):
+        store(w, base + ROWS.exchanges, maximum(swap, load(w, base + ROWS.exchanges)))
         for m in range(j, end):
             a, b = load(w, row + m * WIDTH), load(w, other + m * WIDTH)
             store(w, row + m * WIDTH, where_less(0.5, swap, b, a))
@@ -170,6 +267,8 @@ def exchange(w: Any, base: int, j: int, i: int, end: int) -> None:
 
 def factorise(w: Any, base: int) -> None:
     """Factorise the matrix into triangles by elimination with partial pivoting; keep inverse pivots on the diagonal."""
+    # no row is exchanged with itself: the first element tells whether any is
+    store(w, base + ROWS.exchanges, 0.0 * load(w, base + ROWS.step))
     for j in range(N_SOLVED):
         last, end = min(N_SOLVED, j + 1 + BELOW), min(N_SOLVED, j + 1 + BEHIND)
         row = base + ROWS.matrix + j * N_SOLVED * WIDTH
@@ -208,6 +307,31 @@ def solve(w: Any, base: int) -> None:
         store(w, right + j * WIDTH, x * load(w, row + j * WIDTH))
 
 
+def advance_states(w: Any, base: int, s: int) -> None:
+    """Compute the state at stage `s`; the last stages add one slope each to the state before."""
+    h = load(w, base + ROWS.step)
+    for i in range(N_KNOWN):
+        row = base + i * WIDTH
+        if s > FIRST_ADDED:
+            slope = load(w, row + ROWS.slopes + (s - 1) * N * WIDTH)
+            store(w, row + ROWS.trial, multiply_add(h, slope, load(w, row + ROWS.trial)))
+        else:
+            stage_row(w, row, s, h)
+
+
+def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
+    """Return the mean square of the scaled error of an attempted step: the last slope that it solved for."""
+    h = load(w, base + ROWS.step)
+    total = 0.0 * h
+    for i in range(N_CONTROLLED):
+        row = base + i * WIDTH
+        size = maximum(absolute(load(w, row + ROWS.state)), absolute(load(w, row + ROWS.trial)))
+        floor = atol * SIZES[i]
+        scaled = load(w, row + ROWS.slopes + (N_STAGES - 2) * N * WIDTH) / (rtol * size + floor)
+        total = multiply_add(scaled, scaled, total)
+    return (h * h) * total * (1.0 / N_CONTROLLED)
+
+
 def coupled(w: Any, base: int, i: int, s: int) -> Any:
     """Return gamma times the right-hand side of stage `s` for state `i`, without the change of J along a tangent."""
     row = base + ROWS.slopes + i * WIDTH
@@ -235,8 +359,7 @@ def bent(w: Any, base: int, r: int, s: int, total: Any) -> Any:
 def evaluate_stage(w: Any, base: int, s: int) -> None:
     """Compute the state at stage `s`, and its rates in the row of the stage's slopes."""
     h = load(w, base + ROWS.step)
-    for i in range(N_KNOWN):
-        stage_row(w, base + i * WIDTH, s, h)
+    advance_states(w, base, s)
     if s == 1 or NODES[s] != NODES[s - 1]:
         c = load_rows(w, base + ROWS.constants, NC)
         store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
@@ -256,21 +379,23 @@ def store_solution(w: Any, base: int, first: int, s: int) -> None:
         store(w, row, load(w, base + ROWS.right + POSITIONS[i] * WIDTH))
 
 
-def solve_stage(w: Any, base: int, s: int) -> None:
-    """Compute the slopes of stage `s`: first of the states, then of each tangent vector whose rates `rhs` returns."""
-    for first in range(0, N_KNOWN - N_SOLVED + 1, N_SOLVED):
+def solve_states(w: Any, base: int, s: int) -> None:
+    """Compute the slopes of stage `s` of the states without tangent vectors."""
+    for i in range(N_SOLVED):
+        store(w, base + ROWS.right + POSITIONS[i] * WIDTH, coupled(w, base, i, s))
+    store_solution(w, base, 0, s)
+
+
+def solve_vectors(w: Any, base: int, s: int) -> None:
+    """Compute the slopes of stage `s` of each tangent vector whose rates `rhs` returns, and of the trace's integral."""
+    for first in range(N_SOLVED, N_KNOWN - N_SOLVED + 1, N_SOLVED):
         for i in range(N_SOLVED):
-            total = coupled(w, base, first + i, s)
-            if HAS_CROSS and first > 0:
-                total = bent(w, base, first + i - N_SOLVED, s, total)
+            total = bent(w, base, first + i - N_SOLVED, s, coupled(w, base, first + i, s))
             store(w, base + ROWS.right + POSITIONS[i] * WIDTH, total)
         store_solution(w, base, first, s)
-    # the trace of the Jacobian, on which nothing depends
     for i in range(N_KNOWN - N_KNOWN % N_SOLVED, N_KNOWN):
-        total = coupled(w, base, i, s)
-        store(
-            w, base + ROWS.slopes + (s * N + i) * WIDTH, bent(w, base, i - N_SOLVED, s, total) if HAS_CROSS else total
-        )
+        total = bent(w, base, i - N_SOLVED, s, coupled(w, base, i, s))
+        store(w, base + ROWS.slopes + (s * N + i) * WIDTH, total)
 
 
 def step_vector(w: Any, base: int, k: int) -> None:
@@ -321,13 +446,27 @@ def run_stages(w: Any, base: int) -> None:
     for s in range(1, N_STAGES - 1):
         if s > 1 or CARRIES:
             evaluate_stage(w, base, s)
-        solve_stage(w, base, s)
+        solve_states(w, base, s)
+        if N_KNOWN > N_SOLVED:
+            solve_vectors(w, base, s)
     evaluate_stage(w, base, N_STAGES - 1)
     if CARRIES:
         for k in range(N_VECTORS):
             step_vector(w, base, k)
         if HAS_TRACE:
             step_trace(w, base)
+
+
+def own_templates(bindings: dict[str, Any]) -> dict[str, Callable[..., Any]]:
+    """Return what takes the place of templates of the same name, for the values of the free names."""
+    n, known, band = bindings["N_SOLVED"], bindings["N_KNOWN"], (bindings["BELOW"], bindings["BEHIND"])
+    found: dict[str, Callable[..., Any]] = {"squared_error": squared_error}
+    if n <= UNROLLED:
+        found["factorise"] = unrolled_factors(n, *band)
+        found["solve_states"] = unrolled_stage(bindings["POSITIONS"], *band)
+    if known <= UNROLLED:
+        found["advance_states"] = unrolled_states(known)
+    return found
 
 
 INLINE = ("coupled", "bent")
@@ -339,8 +478,10 @@ CALLED = (
     "factorise",
     "solve",
     "store_solution",
+    "advance_states",
     "evaluate_stage",
-    "solve_stage",
+    "solve_states",
+    "solve_vectors",
     "step_vector",
     "step_trace",
 )
