@@ -253,3 +253,21 @@ def test_integrate__names_what_cannot_be_differentiated():
     many = model_of(lorenz96(65)["equations"], {"F": 8.0})
     with pytest.raises(ValueError, match="65 states; rodas5p solves linear systems of at most 64; choose dopri5"):
         run(dataclasses.replace(many.system, method="rodas5p"), many.load().pack(), np.zeros(65))
+
+
+def test_tangents__agree_with_variational_equations_of_another_integrator():
+    equations = {"x": "v", "v": "mu*(1 - x**2)*v - x + 4*drive"}
+    model, system = driven(equations, {"mu": 30.0})
+    found = run(with_tangents(system, 2), model.load().pack(), [2.0, 0.0, 1.0, 0.0, 0.0, 1.0], 5.0, 1e-12)
+
+    def extended(t, z):
+        x, v, matrix = z[0], z[1], z[2:].reshape(2, 2)
+        jacobian = np.array([[0.0, 1.0], [-60.0 * x * v - 1.0, 30.0 * (1.0 - x**2)]])
+        change = 30.0 * (1.0 - x**2) * v - x + 4.0 * np.cos(0.4 * np.pi * t)
+        return np.concatenate([[v, change], (jacobian @ matrix).ravel()])
+
+    start = [2.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    other = solve_ivp(extended, (0.0, 5.0), start, "Radau", rtol=1e-12, atol=1e-14).y[:, -1]
+    monodromy = found.section[0, 0, 0, 2:].reshape(2, 2).T
+    np.testing.assert_allclose(monodromy, other[2:].reshape(2, 2), atol=1e-8)
+    assert np.abs(monodromy).max() > 1e-3

@@ -71,6 +71,7 @@ RUNS = {
     + '[continuation]\npath = "frequency_hz"\ndirection = "both"\n',
     "order 8": f'{DUFFING}method = "dop853"\n',
     "order 5": DUFFING,
+    "stiff": with_model("forced-van-der-pol") + 'method = "rodas5p"\n',
     "stopped when closed": DUFFING.replace("= 6", "= 400") + CLOSING,
     "impacts": with_model("impact"),
     "friction": with_model("belt-stick").replace("0.15", "0.4").replace("0.25", "0.5"),
@@ -97,6 +98,7 @@ ANALYSES = {
     "pendulum": ("attractors", "basins"),
     "continuation": ("attractors", "hysteresis"),
     "flow": ("attractors", "branches"),
+    "stiff": ("attractors", "branches"),
     "exponents": ("chaos",),
 }
 
