@@ -91,9 +91,10 @@ def unrolled_stage(positions: Sequence[int], below: int, behind: int) -> Callabl
         f"    x{j} = multiply_add(SHIFTS[s], load(w, base + ROWS.drift + {at[j] * WIDTH}), x{j})" for j in range(n)
     ]
     lines += [f"x{j} = GAMMA * x{j}" for j in range(n)]
-    lines += ["if any_nonzero(load(w, base + ROWS.exchanges)):"]
-    lines += [f"    {line}" for line in _eliminated(n, below, True)]
-    lines += ["else:", *(f"    {line}" for line in _eliminated(n, below, False) or ["pass"])]
+    if below > 0:
+        lines += ["if any_nonzero(load(w, base + ROWS.exchanges)):"]
+        lines += [f"    {line}" for line in _eliminated(n, below, True)]
+        lines += ["else:", *(f"    {line}" for line in _eliminated(n, below, False))]
     for j in range(n)[::-1]:
         for m in range(j + 1, min(n, j + 1 + behind)):
             lines.append(f"x{j} = x{j} - load(w, base + ROWS.matrix + {(j * n + m) * WIDTH}) * x{m}")
