@@ -19,8 +19,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from magpend_core.engine.simd import (
     WIDTH,
@@ -41,6 +39,9 @@ from magpend_core.engine.tangents import n_entries
 
 def order_of_states(entries: Sequence[tuple[int, int]], n: int) -> np.ndarray:
     """Return the position of each state in the linear systems, shape (n,), from the Jacobian's (row, column) pairs."""
+    from scipy.sparse import coo_array  # not needed by explicit methods, and slow to import
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     rows, columns = np.array(entries or [(0, 0)]).T
     pattern = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)).tocsr()
     position = np.empty(n, np.int64)
