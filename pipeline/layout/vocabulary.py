@@ -16,12 +16,12 @@ from magpend_core.disturbance import Disturbance
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.drift.model import DriftingModel, drifting
 from magpend_core.models.drift.ramps import ramps_as_data, ramps_from_data
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Model, Parameters, by_method
 from magpend_core.models.noisy import noisy
 from magpend_core.models.sectioned import sectioned
 from magpend_core.sizes import REALIZATION
 from magpend_core.status import Status
-from pipeline.specification.tables import FREQUENCY
+from pipeline.specification.tables import FREQUENCY, STIFF
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -129,7 +129,7 @@ def model_of(ds: xr.Dataset) -> Model:
     """Return the model of a result cube, or of a dataset derived from it, from the attribute ``model``.
 
     If the attributes ``section_...`` name a section by crossing, the model has that section. With the attribute
-    ``drift`` its parameters move.
+    ``drift`` its parameters move. If the attribute ``method`` is that for stiff systems, it is integrated by it.
 
     Raises
     ------
@@ -137,6 +137,8 @@ def model_of(ds: xr.Dataset) -> Model:
         If the attribute names no model. A Python object is not imported: its description suffices to draw.
     """
     model = load_model(str(ds.attrs.get("model", DEFAULT)))
+    if ds.attrs.get("method") == STIFF:
+        model = by_method(model, STIFF)
     if _NOISE in ds.attrs:
         strengths, interpretation = json.loads(ds.attrs[_NOISE])
         return noisy(model, Disturbance(tuple((name, value) for name, value in strengths), interpretation))
@@ -187,7 +189,9 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     return {
         str(key): value
         for key, value in attrs.items()
-        if key in ("model", "parameters", OVERRIDES, DRIFT, _NOISE) or str(key).startswith(_SECTION)
+        if key in ("model", "parameters", OVERRIDES, DRIFT, _NOISE)
+        or str(key).startswith(_SECTION)
+        or (key == "method" and value == STIFF)
     }
 
 

@@ -39,6 +39,14 @@ def test_model_of__section():
     assert frequency_of(load_model(), {"frequency": 3.0}) == 3.0
 
 
+def test_model_of__method():
+    """What is computed of a stiff run, and of its results, is integrated by the run's method."""
+    attrs = {"model": model_attribute(flow(VAN_DER_POL)), **section_attributes(Crossing("v"))}
+    for own, method in (({}, "dopri5"), ({"method": "dop853"}, "dopri5"), ({"method": "rodas5p"}, "rodas5p")):
+        assert model_of(xr.Dataset(attrs=told_by(attrs | own))).system.method == method
+    assert "method" not in told_by({"method": "dop853"})
+
+
 def test_section_pair__leaves_the_crossing_state_out():
     assert section_pair(sectioned(flow(ROSSLER), Crossing("x"))) == ("y", "z")
     assert section_pair(sectioned(flow(ROSSLER), Crossing("y"))) == ("x", "z")
