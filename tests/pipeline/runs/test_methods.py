@@ -9,6 +9,7 @@ from magpend_core.status import Status
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs import methods
+from pipeline.runs.extend import plan_extension
 from pipeline.runs.methods import Decision, decide, decided
 from pipeline.runs.run import prepare, run
 from pipeline.specification.problems import SpecError
@@ -197,6 +198,9 @@ def test_run__keeps_the_decision_and_what_was_written(tmp_path):
     run(van_der_pol(1000.0), tmp_path / "run", workers=0, echo=again.append)
     assert again[-1] == f"{tmp_path / 'run'} is complete; nothing to do."
     assert not any(line.startswith("method: ") for line in again)
+    wider = van_der_pol(1000.0).with_axis("mu", values=[1000.0, 1100.0])
+    (tmp_path / "wider.toml").write_text(wider.toml())
+    assert plan_extension([tmp_path / "run"], tmp_path / "wider.toml").plan.spec.integration.method == "rodas5p"
     by_hand = run(van_der_pol(1000.0, method="rodas5p"), tmp_path / "by-hand", workers=0, echo=silent)
     assert by_hand.info.digest == info.digest
 
