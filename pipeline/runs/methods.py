@@ -29,10 +29,13 @@ PROBED_CELLS, PROBED_PERIODS = 8, 4
 """Most cells that are integrated for a decision, and most of their periods."""
 
 LOOSER, LOOSEST = 1e3, 1e-2
-"""Factor between the two tolerances, and the largest one; if it is exceeded, the second one is smaller instead."""
+"""Factor between the two tolerances, and the largest one; above it the second one is finer than the run's instead."""
 
 ORDER_OF_EXPLICIT = 5
 """Order of the explicit method: its steps are in proportion to the root of this order of 1/tolerance."""
+
+HARDLY = 2.0
+"""Ratio of the steps at both tolerances below which they hardly differ; the law of accuracy gives 4."""
 
 LEAST_STEPS = 4
 """Steps that a stiff method takes in a period at any tolerance."""
@@ -127,22 +130,21 @@ def compile_kernel(plan: Plan, echo: Callable[[str], None]) -> None:
 def decide(plan: Plan, echo: Callable[[str], None]) -> Decision:
     """Decide the method of a run from cells that are spread over it. If the stiff one is compiled, `echo` tells it."""
     spec, inputs = plan.spec, plan.cells.spread(PROBED_CELLS)
-    factor = LOOSER if max(spec.integration.rtol, spec.integration.atol) * LOOSER <= LOOSEST else 1.0 / LOOSER
-    exact, other = _count(spec, inputs), _count(spec, inputs, factor)
-    known = exact.is_known & other.is_known
-    if not known.any():
+    exact = _count(spec, inputs)
+    if not exact.is_known.any():  # coarse explicit steps may lose a stiff motion
+        spec = _at(spec, 1.0 / LOOSER)
+        exact = _count(spec, inputs)
+    inputs, exact = inputs.take(exact.is_known), exact.take(exact.is_known)
+    if not len(exact.status):
         return Decision(EXPLICIT, "no cell tells how long its steps can be")
-    exact, other, inputs = exact.take(known), other.take(known), inputs.take(known)
-    cost = CHEAPER_BY * cost_of_stiff_step(len(spec.model.states))
-    by_accuracy = _by_accuracy(exact, other, factor) + LEAST_STEPS * (exact.periods + 1)
-    if exact.attempts.sum() <= cost * by_accuracy.sum() or not _at_stability_limit(spec, inputs, exact):
+    if not _looks_stiff(spec, inputs, exact):
         return Decision(EXPLICIT, "accuracy limits its steps")
     plan = replace(plan, spec=spec.by_method(STIFF))
     try:
         compile_kernel(plan, echo)
     except ValueError as error:
         return Decision(EXPLICIT, f"{STIFF} does not suit: {str(error).rstrip('.')}")
-    return _cheaper(exact, _count(plan.spec, inputs), cost)
+    return _cheaper(exact, _count(plan.spec, inputs), cost_of_stiff_step(len(spec.model.states)))
 
 
 def _cheaper(explicit: _Count, stiff: _Count, cost: float) -> Decision:
@@ -151,23 +153,29 @@ def _cheaper(explicit: _Count, stiff: _Count, cost: float) -> Decision:
         return Decision(EXPLICIT, f"{STIFF} loses cells")
     many, few = int(explicit.attempts.sum()), int(stiff.attempts.sum())
     more = "more than " if explicit.is_limited.any() else ""
-    is_stiff = many > cost * few or bool((explicit.is_limited & ~stiff.is_limited).any())
+    is_stiff = many > CHEAPER_BY * cost * few or bool((explicit.is_limited & ~stiff.is_limited).any())
     method = STIFF if is_stiff else EXPLICIT
-    return Decision(method, f"{few} steps of {STIFF} do what takes {more}{many} of {EXPLICIT}")
+    steps = f"{few} steps of {STIFF}, each as long as {cost:.1f}, do what takes {more}{many} of {EXPLICIT}"
+    return Decision(method, steps)
+
+
+def _at(spec: Spec, scale: float) -> Spec:
+    """Return a specification with scaled tolerances."""
+    own = spec.integration
+    scaled = {"rtol": max(own.rtol * scale, 1e-13), "atol": own.atol * scale}
+    return spec.replace(integration=own.model_copy(update=scaled))
 
 
 def _count(spec: Spec, inputs: Inputs, scale: float = 1.0, limit: int = MOST_STEPS) -> _Count:
-    """Integrate cells for some periods at a scaled tolerance, and count their steps."""
+    """Integrate cells for some periods at scaled tolerances, and count their steps."""
     from pipeline.compute.integrate import watched_quantities
 
-    own = spec.integration
+    own = _at(spec, scale).integration
     n = min(PROBED_PERIODS, own.n_transient + own.n_keep)
     never = 1e-300  # a tolerance that no orbit meets
     changed = {
         "n_transient": 0,
         "n_keep": n,
-        "rtol": max(own.rtol * scale, 1e-13),
-        "atol": own.atol * scale,
         "max_steps_per_period": min(own.max_steps_per_period, limit),
         "closure_tolerance": never,
     }
@@ -182,10 +190,27 @@ def _count(spec: Spec, inputs: Inputs, scale: float = 1.0, limit: int = MOST_STE
     return _Count(attempts, periods, seconds, cells.status[:, 0], cells.final_state[:, 0])
 
 
-def _by_accuracy(exact: _Count, other: _Count, factor: float) -> np.ndarray:
-    """Return the steps of each cell that accuracy asks for: those that change with the tolerance by its law."""
+def _looks_stiff(spec: Spec, inputs: Inputs, exact: _Count) -> bool:
+    """Return whether other limits than accuracy make the steps so short that the stiff method may be cheaper.
+
+    There are two signs: so few steps change with the tolerance by the law of accuracy that as many stiff ones would be
+    cheaper; or the whole count hardly changes, as it also does where layers limit steps.
+    """
+    is_coarse = max(spec.integration.rtol, spec.integration.atol) * LOOSER > LOOSEST
+    factor = 1.0 / LOOSER if is_coarse else LOOSER
+    other = _count(spec, inputs, factor)
+    if factor > 1.0 and not other.is_known.all():  # coarse steps may lead elsewhere
+        factor = 1.0 / LOOSER
+        other = _count(spec, inputs, factor)
+    known = other.is_known
+    inputs, exact, other = inputs.take(known), exact.take(known), other.take(known)
     changed = (exact.attempts - other.attempts) / (1.0 - factor ** (-1.0 / ORDER_OF_EXPLICIT))
-    return np.asarray(np.maximum(changed, 0.0))
+    by_accuracy = np.maximum(changed, 0.0) + LEAST_STEPS * (exact.periods + 1)
+    cost = cost_of_stiff_step(len(spec.model.states))
+    few, many = sorted((exact.attempts.sum(), other.attempts.sum()))
+    hardly = many < HARDLY * few and not spec.motion.system.has_layers
+    seems = hardly or exact.attempts.sum() > CHEAPER_BY * cost * by_accuracy.sum()
+    return bool(known.any() and seems) and _at_stability_limit(spec, inputs, exact)
 
 
 def _at_stability_limit(spec: Spec, inputs: Inputs, exact: _Count) -> bool:
