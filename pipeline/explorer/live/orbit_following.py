@@ -30,6 +30,7 @@ from pipeline.explorer.live.messages import CellPoint, FollowRequest
 from pipeline.explorer.live.settling import Place, system_at
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.vocabulary import PERIODIC_ORBIT, axes_of, axis_name
+from pipeline.specification.tables import EXPLICIT, STIFF
 
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
@@ -151,8 +152,10 @@ class Follower:
         scale = max(abs(here), abs(target - here), 1e-9)
         if axis is not None and len(axis.values) > 1:
             scale = float(np.ptp(axis.values))
+        own = self._live.integration
+        method = STIFF if own.method == STIFF else EXPLICIT  # steps of order 8 are not sampled
         return Family(
-            system_at(place, self._live.integration.model_copy(update={"method": "dopri5"})),
+            system_at(place, own.model_copy(update={"method": method})),
             held.period,
             place.frequency,
             place.parameters.pack(),

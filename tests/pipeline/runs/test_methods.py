@@ -227,3 +227,13 @@ def test_run__of_an_ordinary_system_has_the_digest_and_the_bits_of_dopri5(tmp_pa
         one = run(van_der_pol(1.0, method=method), tmp_path / method, workers=0, echo=silent)
         found[method] = one.info.digest, one.cube().section.values.tobytes()
     assert found["auto"] == found["dopri5"]
+
+
+@pytest.mark.slow
+def test_decide__impacts_leave_steps_short_that_are_not_stiff(monkeypatch):
+    spec = Spec.read("tests/zoo/systems/ball-on-shaken-table.toml")
+    inputs = (plan := make_plan(spec)).cells.spread(8)
+    exact, coarse = (methods._count(plan.spec, inputs, scale) for scale in (1.0, 1e3))
+    assert exact.attempts.sum() < 1.1 * coarse.attempts.sum()
+    monkeypatch.setattr(methods, "compile_kernel", None)  # nothing else is compiled
+    assert method_of(spec) == "dopri5"
