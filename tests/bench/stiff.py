@@ -20,7 +20,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # tests are no package
 
 from tests.core.stiff import PROBLEMS, Stiff
 
-METHOD = "dopri5"
+METHOD = "rodas5p"
 N_ERROR, N_SLOW = 8, 2
 PEERS = ("numbalsoda", "sksundae", "diffrax", "scipy")
 SPREAD = {
