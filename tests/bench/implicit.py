@@ -97,6 +97,7 @@ def cvode_loop(rhs: Any, jacobian: Any, n: int, time: float) -> Callable[[float]
 
     context = _POINTER()
     _function("core", "SUNContext_Create", _INT, _INT, _POINTER)(0, ctypes.byref(context))
+    _function("core", "SUNContext_ClearErrHandlers", _INT, _POINTER)(context)
     numbers = np.zeros(n)
     vector = _function("nvecserial", "N_VMake_Serial", _POINTER, _INT, _POINTER, _POINTER)(
         n, numbers.ctypes.data, context

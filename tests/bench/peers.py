@@ -31,7 +31,7 @@ mu = 1000 run from start to end beside
 * diffrax: Kvaerno's method of order 5, all trajectories at once (``vmap``, ``jit``, time of compilation left out);
 * scipy: `solve_ivp` with LSODA and Radau on the compiled right-hand side and Jacobian.
 
-Errors are those at the end, against scipy's Radau at 1e-11; a period is a run from start to end.
+Errors are those at the end, against scipy's Radau at 1e-10; a period is a run from start to end.
 
 All peers are the dependency group ``bench``; a missing one is reported and left out.
 """

@@ -110,7 +110,8 @@ class Curve:
         """Return errors, falling, and costs of the points that no other point beats in both."""
         order = np.argsort(self.cost)
         error, cost = np.array(self.error)[order], np.array(self.cost)[order]
-        keep = np.isfinite(error) & (error < np.minimum.accumulate(np.append(np.inf, error[:-1])))
+        error = np.where(np.isfinite(error), error, np.inf)
+        keep = error < np.minimum.accumulate(np.append(np.inf, error[:-1]))
         return error[keep], cost[keep]
 
     def cost_at(self, error: float) -> float:
