@@ -53,8 +53,8 @@ LEAST_RADIUS = 1.0
 def cost_of_stiff_step(n_states: int) -> float:
     """Return the time of an attempted step of the stiff method, in attempted steps of the explicit one.
 
-    Measured on rings of van der Pol oscillators: 1.6 to 4.6 for 2 and 4 states, 2.7 to 5.5 for 8, 4 to 6 for 16, 8 to
-    20 for 32, 9 to 33 for 64, the more the denser the Jacobian is.
+    Measured on rings of van der Pol oscillators: 1.6 to 2.2 for 2 and 4 states, 2.2 to 3.2 for 8, 4 to 7 for 16, 8 to
+    20 for 32, 9 to 33 for 64, the more the denser the Jacobian is. It is rounded up for few states.
     """
     return 2.0 + n_states / 4.0
 
