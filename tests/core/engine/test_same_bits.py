@@ -111,6 +111,9 @@ print(digest(run_branches(packed, frequency, starts, **settings)))
 packed, frequency, starts = (inputs["struck_" + k] for k in ("packed", "frequency", "starts"))
 settings = {"n_transient": 0, "n_keep": 9, "rtol": 1e-7, "atol": 1e-7, "system": load_model("impact").system}
 print(digest(run_branches(packed, frequency, starts, **settings)))
+settings = {"n_transient": 3, "n_keep": 3, "rtol": 1e-7, "atol": 1e-7, "method": "rodas5p"}
+packed, frequency, starts = (inputs["stiff_" + k] for k in ("packed", "frequency", "starts"))
+print(digest(run_branches(packed, frequency, starts, system=load_model("flutter").system, **settings)))
 print(test_noisy.digest())
 code = "".join(engine_of(PENDULUM_FITTED, RECORD, ()).__wrapped__.inspect_asm().values())
 print(WIDTH)
@@ -127,6 +130,13 @@ def struck():
     return packed, rng.uniform(0.1, 0.3, (40, 1)), rng.uniform(-1.0, 1.0, (40, 2))
 
 
+def stiff():
+    """Branches of six states for the implicit method."""
+    model = load_model("flutter")
+    packed = np.tile(model.load().pack(), (40, 1, 1)) * np.random.default_rng(17).uniform(0.9, 1.1, (40, 1, 1))
+    return packed, np.full((40, 1), 1.0), np.random.default_rng(19).uniform(-1.0, 1.0, (40, 6))
+
+
 def digest(found):
     return hashlib.sha256(found.section.tobytes() + found.n_steps.tobytes()).hexdigest()
 
@@ -136,9 +146,16 @@ def straight_struck():
     return run_many(*struck(), system=load_model("impact").system, n_transient=0, n_keep=9)
 
 
+@pytest.fixture(scope="module")
+def straight_stiff():
+    found = run_many(*stiff(), system=load_model("flutter").system, n_transient=3, n_keep=3, method="rodas5p")
+    assert np.isfinite(found.section).all()
+    return found
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("build", BUILDS)
-def test_engine__same_bits_however_it_is_built(straight, straight_struck, run_python, tmp_path, build):
+def test_engine__same_bits_however_it_is_built(straight, straight_struck, straight_stiff, run_python, tmp_path, build):
     settings, package = BUILDS[build], Path(magpend_core.__file__).parent.parent
     if settings and platform.machine() not in ("x86_64", "AMD64"):
         pytest.skip(f"this machine, a {platform.machine()}, cannot run code for {build}")
@@ -156,14 +173,16 @@ def test_engine__same_bits_however_it_is_built(straight, straight_struck, run_py
         simd.write_text(simd.read_text().replace("WIDTH = 16\n", "WIDTH = 1\n"))
     names = "packed", "frequency", "starts"
     inputs = dict(zip(names, many(), strict=True)) | {
-        f"struck_{name}": x for name, x in zip(names, struck(), strict=True)
+        f"{kind}_{name}": x
+        for kind, cells in (("struck", struck()), ("stiff", stiff()))
+        for name, x in zip(names, cells, strict=True)
     }
     np.savez(tmp_path / "inputs.npz", **inputs)
     path = f"{package}{os.pathsep}{Path(test_noisy.__file__).parent}"
     out = run_python(SCRIPT, package=path, MAGPEND_CACHE="0", **settings).splitlines()
-    assert out[:3] == [digest(straight), digest(straight_struck), test_noisy.digest()]
-    assert out[3] == ("1" if build.startswith("scalar") else "16")
-    assert out[4] == INSTRUCTIONS[build]
+    assert out[:4] == [digest(straight), digest(straight_struck), digest(straight_stiff), test_noisy.digest()]
+    assert out[4] == ("1" if build.startswith("scalar") else "16")
+    assert out[5] == INSTRUCTIONS[build]
 
 
 def test_run_branches__continues_bit_for_bit():
