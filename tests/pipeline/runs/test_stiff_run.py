@@ -7,6 +7,7 @@ from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import silent
+from tests.pipeline.runs.test_golden_bits import DRIVE, DUFFING, RUNS
 
 SPEC = """kind = "sweep"
 [model]
@@ -28,6 +29,8 @@ method = "METHOD"
 [products]
 lyapunov = { n_transient = 8, n_periods = 32, n_blocks = 4 }
 """
+
+WATCHED = f'{DUFFING}[products]\nextremes = {{ quantities = ["x"] }}\n'
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +83,27 @@ def test_bifurcations__of_a_stiff_run_are_those_of_an_explicit_one(both):
     explicit, stiff = of(both, "sensitivities")
     for name, near in (("derivative", 1e-5), ("elasticity", 1e-5)):
         np.testing.assert_allclose(stiff[name].values, explicit[name].values, rtol=near)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["drift", "recorded drive", "friction", "watched"])
+def test_cells__of_a_stiff_run_are_those_of_an_explicit_one(tmp_path, name):
+    (tmp_path / "drive.csv").write_text(DRIVE, "utf-8")
+    found = []
+    for method in ("dopri5", "rodas5p"):
+        text = (
+            {**RUNS, "watched": WATCHED}[name]
+            .replace("[integration]", f'[integration]\nmethod = "{method}"')
+            .replace("1e-7", "1e-10")
+            .replace("= 6", "= 0")
+        )
+        (tmp_path / "spec.toml").write_text(text, "utf-8")
+        run(tmp_path / "spec.toml", tmp_path / method, workers=0, echo=silent)
+        found.append(RunDirectory.open(tmp_path / method).cube())
+    explicit, stiff = found
+    assert (stiff.status.values == explicit.status.values).all()
+    np.testing.assert_allclose(stiff.section.values, explicit.section.values, atol=2e-5)
+    assert (stiff.n_steps.values != explicit.n_steps.values).any()
+    for key in set(explicit.data_vars) & {"x_min", "x_max", "x_mean"}:
+        np.testing.assert_allclose(stiff[key].values, explicit[key].values, atol=1e-4)
+    assert name != "watched" or "x_max" in explicit
