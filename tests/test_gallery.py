@@ -11,7 +11,10 @@ import re
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, fsolve
 
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.report import command_of
@@ -175,3 +178,89 @@ def test_notebook__executed_it_prints_and_draws_what_the_page_shows(name, tmp_pa
     assert [line for line in printed if not any(tutorials.alike(line, one) for one in seen)] == []
     assert [output for output in outputs if "image/png" in output.get("data", {})]
     assert not tutorials.is_stale(PAGES / f"{name}.png", tmp_path / f"{name}.png")
+
+
+# ---- numbers computed apart --------------------------------------------------------------------------------
+
+
+def claimed(figure, words):
+    (found,) = (claim.expected for claim in FIGURE[figure].claims if words in claim.statement)
+    return found
+
+
+def axon_gates(v):
+    """Opening and closing rates of Hodgkin and Huxley's gates m, h and n [1/ms], of the depolarisation [mV]."""
+
+    def ratio(u):
+        return u / np.expm1(u) if u else 1.0
+
+    return (
+        (ratio((25 - v) / 10), 4 * np.exp(-v / 18)),
+        (0.07 * np.exp(-v / 20), 1 / (1 + np.exp((30 - v) / 10))),
+        (0.1 * ratio((10 - v) / 10), 0.125 * np.exp(-v / 80)),
+    )
+
+
+def axon(state, current):
+    v, m, h, n = state
+    leak = 120 * m**3 * h * (v - 115) + 36 * n**4 * (v + 12) + 0.3 * (v - 10.599)
+    return np.array(
+        [current - leak, *(a * (1 - x) - b * x for x, (a, b) in zip(state[1:], axon_gates(v), strict=True))]
+    )
+
+
+def axon_at_rest(v):
+    """State at rest with a depolarisation, and the current that holds it."""
+    state = np.array([v, *(a / (a + b) for a, b in axon_gates(v))])
+    return state, -axon(state, 0.0)[0]
+
+
+def test_claims__hopf_points_of_the_axon():
+    """Hurwitz's determinant of order three vanishes there."""
+
+    def determinant(v):
+        state, current = axon_at_rest(v)
+        rows = [(axon(state + step, current) - axon(state - step, current)) / 2e-5 for step in 1e-5 * np.eye(4)]
+        _, a, b, c, d = np.poly(np.transpose(rows))
+        return a * b * c - c * c - a * a * d
+
+    for words, low, high in (("Rest loses", 4.0, 7.0), ("Firing ends", 20.0, 23.0)):
+        current = axon_at_rest(brentq(determinant, low, high, xtol=1e-13))[1]
+        assert current == pytest.approx(claimed("hodgkin-huxley", words), abs=1e-5), words
+
+
+@pytest.mark.slow
+def test_claims__first_fold_of_the_axon():
+    """Among the cycles through v = 31.883 mV with a given n, the current is least at the fold."""
+
+    def mismatch(unknowns, n):
+        m, h, period, current = unknowns
+        start = [31.883, m, h, n]
+        ends = solve_ivp(lambda _, y: axon(y, current), (0.0, period), start, "DOP853", rtol=1e-11, atol=1e-12)
+        return ends.y[:, -1] - start
+
+    step = 1e-4
+    found = [
+        fsolve(mismatch, [0.8634, 0.0692, 19.9, 6.2645], args=(0.746007 + k * step,), xtol=1e-13)[3] for k in (-1, 0, 1)
+    ]
+    bend, slope = found[0] - 2.0 * found[1] + found[2], 0.5 * (found[2] - found[0])
+    fold = found[1] - 0.5 * slope**2 / bend
+    assert fold == pytest.approx(6.2645213, abs=1e-7)
+    assert fold == pytest.approx(claimed("hodgkin-huxley", "Firing begins"), abs=5e-5)
+
+
+def test_claims__hopf_points_of_the_oregonator():
+    """Hurwitz's condition, at the positive root of -q x^2 + (1 - q - f) x + 1 + f."""
+    s, q, w = 77.27, 8.375e-6, 0.161
+
+    def determinant(f):
+        x = max(np.roots([-q, 1.0 - q - f, 1.0 + f]))
+        y = f * x / (1.0 + x)
+        jacobian = [[s * (1.0 - y - 2.0 * q * x), s * (1.0 - x), 0.0], [-y / s, -(1.0 + x) / s, f / s], [w, 0.0, -w]]
+        _, a, b, c = np.poly(jacobian)
+        return a * b - c
+
+    for words, low, high in (("unstable", 0.4, 0.6), ("stable again", 1.4, 1.6)):
+        assert brentq(determinant, low, high, xtol=1e-14) == pytest.approx(claimed("oregonator", words), abs=5e-8), (
+            words
+        )

@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
 from magpend_core.crossing import Crossing
+from magpend_core.models.model import by_method
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import branches_table, table_of, windows_of
 from pipeline.analysis.branches.arclength import Settings
@@ -24,9 +25,23 @@ from tests.core.flows import BAUTIN, HOPF, LORENZ, PAIR, ROSSLER, flow, table
 pytestmark = pytest.mark.slow
 
 
-def followed(equations, of, state, parameter, low, high, *, max_period=1, level=0.0, longest=50.0, step=0.02, **values):
+def followed(
+    equations,
+    of,
+    state,
+    parameter,
+    low,
+    high,
+    *,
+    max_period=1,
+    level=0.0,
+    longest=50.0,
+    step=0.02,
+    method="dopri5",
+    **values,
+):
     """Branches from a limit cycle near a state, in steps that are as long as the bounds of the test allow."""
-    parameters = sectioned(flow(equations), Crossing(of, level, longest=longest)).load(**values)
+    parameters = sectioned(by_method(flow(equations), method), Crossing(of, level, longest=longest)).load(**values)
     model = parameters.model
     family = family_of(model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low)
     start = Start(family, np.array(state, float), parameters[parameter])
@@ -239,11 +254,12 @@ CANARD = table("canard", {"x": "(y - x**3/3 + x)/eps", "y": "a - x"}, {"a": 0.95
 """Van der Pol's oscillator with a constant force: relaxation cycles for a < a_c, rest for a > 1 (Hopf point at 1)."""
 
 
-def test_explore__through_a_canard_explosion():
+@pytest.mark.parametrize("method", ["dopri5", "rodas5p"])
+def test_explore__through_a_canard_explosion(method):
     """The cycles shrink at a_c = 1 - eps/8 - 3 eps^2/32 - 173 eps^3/1024 (Zvonkin and Shubin 1984) within exp(-1/eps),
     and their section point stands still while the period grows.
     """
-    ds = followed(CANARD, "x", [1.0, 0.8956], "a", 0.9, 1.01, level=1.0, longest=20.0, a=0.95)
+    ds = followed(CANARD, "x", [1.0, 0.8956], "a", 0.9, 1.01, level=1.0, longest=20.0, method=method, a=0.95)
     ends = str(ds["first_end"].attrs["flag_meanings"]).split()
     assert [ends[int(ds[name][0])] for name in ("first_end", "last_end")] == ["bound", "equilibrium"]
     assert int(ds["n_points"][0]) < 600
