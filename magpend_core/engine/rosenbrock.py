@@ -11,6 +11,8 @@ with the change of J along v times the slope of the states on the right-hand sid
 
 The first slope is the rate at the step's begin, the last that at its end, as in the explicit methods: so events, layers
 and dense output are the same for both.
+
+Of systems with few states `own_templates` writes loops out, so that sums stay in registers; the bits are the same.
 """
 
 from __future__ import annotations
@@ -52,92 +54,6 @@ def order_of_states(entries: Sequence[tuple[int, int]], n: int) -> np.ndarray:
 
     same = np.arange(n)
     return position if band(position) < band(same) else same
-
-
-UNROLLED = 10
-"""Most states whose stages and linear systems are computed in registers."""
-
-
-def unrolled_states(n: int) -> Callable[..., None]:
-    """Return `advance_states` for a small system, with its loops over states written out."""
-    last = "w, base + ROWS.slopes + (s - 1) * N * WIDTH"
-    lines = ["def advance_states(w, base, s):", "h = load(w, base + ROWS.step)", "if s > FIRST_ADDED:"]
-    for i in range(n):
-        at = f"w, base + ROWS.trial + {i * WIDTH}"
-        lines.append(f"    store({at}, multiply_add(h, load({last} + {i * WIDTH}), load({at})))")
-    lines += ["else:"]
-    lines += [f"    x{i} = STAGES[s, 1] * load(w, base + ROWS.slopes + N * WIDTH + {i * WIDTH})" for i in range(n)]
-    lines += ["    for j in range(2, s):"]
-    for i in range(n):
-        slope = f"load(w, base + ROWS.slopes + j * N * WIDTH + {i * WIDTH})"
-        lines.append(f"        x{i} = multiply_add(STAGES[s, j], {slope}, x{i})")
-    for i in range(n):
-        state = f"load(w, base + ROWS.state + {i * WIDTH})"
-        lines.append(f"    store(w, base + ROWS.trial + {i * WIDTH}, {state} + h * x{i})")
-    return _made("advance_states", lines)
-
-
-def unrolled_stage(positions: Sequence[int], below: int, behind: int) -> Callable[..., None]:
-    """Return `solve_states` for a small system, with its loops over states written out."""
-    n, at = len(positions), [int(i) for i in np.argsort(positions)]  # the state of each row
-    lines = [
-        "def solve_states(w, base, s):",
-        "rates = base + ROWS.slopes if s == 1 else base + ROWS.slopes + s * N * WIDTH",
-    ]
-    lines += [f"x{j} = load(w, rates + {at[j] * WIDTH})" for j in range(n)]
-    lines += ["for j in range(1, s):", "    slopes = base + ROWS.slopes + j * N * WIDTH"]
-    lines += [f"    x{j} = multiply_add(COUPLINGS[s, j], load(w, slopes + {at[j] * WIDTH}), x{j})" for j in range(n)]
-    lines += ["if IS_TIMED:"]
-    lines += [
-        f"    x{j} = multiply_add(SHIFTS[s], load(w, base + ROWS.drift + {at[j] * WIDTH}), x{j})" for j in range(n)
-    ]
-    lines += [f"x{j} = GAMMA * x{j}" for j in range(n)]
-    if below > 0:
-        lines += ["if any_nonzero(load(w, base + ROWS.exchanges)):"]
-        lines += [f"    {line}" for line in _eliminated(n, below, True)]
-        lines += ["else:", *(f"    {line}" for line in _eliminated(n, below, False))]
-    for j in range(n)[::-1]:
-        for m in range(j + 1, min(n, j + 1 + behind)):
-            lines.append(f"x{j} = x{j} - load(w, base + ROWS.matrix + {(j * n + m) * WIDTH}) * x{m}")
-        lines.append(f"x{j} = x{j} * load(w, base + ROWS.matrix + {j * (n + 1) * WIDTH})")
-        lines.append(f"store(w, base + ROWS.slopes + s * N * WIDTH + {at[j] * WIDTH}, x{j})")
-    return _made("solve_states", lines)
-
-
-def _eliminated(n: int, below: int, exchanges: bool) -> list[str]:
-    lines = []
-    for j in range(n):
-        rows = range(j + 1, min(n, j + 1 + below))
-        for i in rows if exchanges else ():
-            at = f"base + ROWS.exchanges + {(i * n + j) * WIDTH}"
-            lines += [f"swap = load(w, {at})", f"other = where_less(0.5, swap, x{i}, x{j})"]
-            lines += [f"x{i} = where_less(0.5, swap, x{j}, x{i})", f"x{j} = other"]
-        lines += [f"x{i} = x{i} - load(w, base + ROWS.matrix + {(i * n + j) * WIDTH}) * x{j}" for i in rows]
-    return lines
-
-
-def _made(name: str, lines: list[str]) -> Callable[..., None]:
-    scope: dict[str, Any] = {}
-    exec("\n    ".join(lines), globals(), scope)
-    function: Callable[..., None] = scope[name]
-    return function
-
-
-def unrolled_factors(n: int, below: int, behind: int) -> Callable[..., None]:
-    """Return `factorise` for a small system, with its loops written out."""
-    lines = ["def factorise(w, base):", "store(w, base + ROWS.exchanges, 0.0 * load(w, base + ROWS.step))"]
-    for j in range(n):
-        last, end = min(n, j + 1 + below), min(n, j + 1 + behind)
-        lines += [f"exchange(w, base, {j}, {i}, {end})" for i in range(j + 1, last)]
-        row = f"w, base + ROWS.matrix + {j * n * WIDTH}"
-        lines += [f"inverse = 1.0 / load({row} + {j * WIDTH})", f"store({row} + {j * WIDTH}, inverse)"]
-        lines += [f"p{m} = load({row} + {m * WIDTH})" for m in range(j + 1, end)]
-        for i in range(j + 1, last):
-            other = f"w, base + ROWS.matrix + {i * n * WIDTH}"
-            lines += [f"factor = load({other} + {j * WIDTH}) * inverse", f"store({other} + {j * WIDTH}, factor)"]
-            for m in range(j + 1, end):
-                lines.append(f"store({other} + {m * WIDTH}, load({other} + {m * WIDTH}) - factor * p{m})")
-    return _made("factorise", lines)
 
 
 def _first_added(stages: np.ndarray) -> int:
@@ -218,8 +134,8 @@ def implicit_bindings(system: System) -> dict[str, Any]:
         "AT_LEAVING": (starts[3] - len(of_trace.timed)) * WIDTH,
         "POSITIONS": at,
         "PLACES": np.array([at[i] * n + at[j] for i, j in own.entries] or [0]),
-        "BELOW": max(0, *offsets, 0),
-        "BEHIND": max(0, *offsets, 0) - min(0, *offsets, 0),
+        "BELOW": max([0, *offsets]),
+        "BEHIND": max([0, *offsets]) - min([0, *offsets]),
         "DRIFTING": np.array(own.timed or (0,)),
         "BENDING": np.array(of_vector.timed or (0,)),
         "CROSS_STARTS": np.searchsorted([i for i, _ in of_vector.entries], np.arange(n_bent + 1)),
@@ -457,6 +373,92 @@ def run_stages(w: Any, base: int) -> None:
             step_vector(w, base, k)
         if HAS_TRACE:
             step_trace(w, base)
+
+
+UNROLLED = 10
+"""Most states whose stages and linear systems are computed in registers."""
+
+
+def unrolled_states(n: int) -> Callable[..., None]:
+    """Return `advance_states` for a small system, with its loops over states written out."""
+    last = "w, base + ROWS.slopes + (s - 1) * N * WIDTH"
+    lines = ["def advance_states(w, base, s):", "h = load(w, base + ROWS.step)", "if s > FIRST_ADDED:"]
+    for i in range(n):
+        at = f"w, base + ROWS.trial + {i * WIDTH}"
+        lines.append(f"    store({at}, multiply_add(h, load({last} + {i * WIDTH}), load({at})))")
+    lines += ["else:"]
+    lines += [f"    x{i} = STAGES[s, 1] * load(w, base + ROWS.slopes + N * WIDTH + {i * WIDTH})" for i in range(n)]
+    lines += ["    for j in range(2, s):"]
+    for i in range(n):
+        slope = f"load(w, base + ROWS.slopes + j * N * WIDTH + {i * WIDTH})"
+        lines.append(f"        x{i} = multiply_add(STAGES[s, j], {slope}, x{i})")
+    for i in range(n):
+        state = f"load(w, base + ROWS.state + {i * WIDTH})"
+        lines.append(f"    store(w, base + ROWS.trial + {i * WIDTH}, {state} + h * x{i})")
+    return _made("advance_states", lines)
+
+
+def unrolled_stage(positions: Sequence[int], below: int, behind: int) -> Callable[..., None]:
+    """Return `solve_states` for a small system, with its loops over states written out."""
+    n, at = len(positions), [int(i) for i in np.argsort(positions)]  # the state of each row
+    lines = [
+        "def solve_states(w, base, s):",
+        "rates = base + ROWS.slopes if s == 1 else base + ROWS.slopes + s * N * WIDTH",
+    ]
+    lines += [f"x{j} = load(w, rates + {at[j] * WIDTH})" for j in range(n)]
+    lines += ["for j in range(1, s):", "    slopes = base + ROWS.slopes + j * N * WIDTH"]
+    lines += [f"    x{j} = multiply_add(COUPLINGS[s, j], load(w, slopes + {at[j] * WIDTH}), x{j})" for j in range(n)]
+    lines += ["if IS_TIMED:"]
+    lines += [
+        f"    x{j} = multiply_add(SHIFTS[s], load(w, base + ROWS.drift + {at[j] * WIDTH}), x{j})" for j in range(n)
+    ]
+    lines += [f"x{j} = GAMMA * x{j}" for j in range(n)]
+    if below > 0:
+        lines += ["if any_nonzero(load(w, base + ROWS.exchanges)):"]
+        lines += [f"    {line}" for line in _eliminated(n, below, True)]
+        lines += ["else:", *(f"    {line}" for line in _eliminated(n, below, False))]
+    for j in range(n)[::-1]:
+        for m in range(j + 1, min(n, j + 1 + behind)):
+            lines.append(f"x{j} = x{j} - load(w, base + ROWS.matrix + {(j * n + m) * WIDTH}) * x{m}")
+        lines.append(f"x{j} = x{j} * load(w, base + ROWS.matrix + {j * (n + 1) * WIDTH})")
+        lines.append(f"store(w, base + ROWS.slopes + s * N * WIDTH + {at[j] * WIDTH}, x{j})")
+    return _made("solve_states", lines)
+
+
+def _eliminated(n: int, below: int, exchanges: bool) -> list[str]:
+    lines = []
+    for j in range(n):
+        rows = range(j + 1, min(n, j + 1 + below))
+        for i in rows if exchanges else ():
+            at = f"base + ROWS.exchanges + {(i * n + j) * WIDTH}"
+            lines += [f"swap = load(w, {at})", f"other = where_less(0.5, swap, x{i}, x{j})"]
+            lines += [f"x{i} = where_less(0.5, swap, x{j}, x{i})", f"x{j} = other"]
+        lines += [f"x{i} = x{i} - load(w, base + ROWS.matrix + {(i * n + j) * WIDTH}) * x{j}" for i in rows]
+    return lines
+
+
+def _made(name: str, lines: list[str]) -> Callable[..., None]:
+    scope: dict[str, Any] = {}
+    exec("\n    ".join(lines), globals(), scope)
+    function: Callable[..., None] = scope[name]
+    return function
+
+
+def unrolled_factors(n: int, below: int, behind: int) -> Callable[..., None]:
+    """Return `factorise` for a small system, with its loops written out."""
+    lines = ["def factorise(w, base):", "store(w, base + ROWS.exchanges, 0.0 * load(w, base + ROWS.step))"]
+    for j in range(n):
+        last, end = min(n, j + 1 + below), min(n, j + 1 + behind)
+        lines += [f"exchange(w, base, {j}, {i}, {end})" for i in range(j + 1, last)]
+        row = f"w, base + ROWS.matrix + {j * n * WIDTH}"
+        lines += [f"inverse = 1.0 / load({row} + {j * WIDTH})", f"store({row} + {j * WIDTH}, inverse)"]
+        lines += [f"p{m} = load({row} + {m * WIDTH})" for m in range(j + 1, end)]
+        for i in range(j + 1, last):
+            other = f"w, base + ROWS.matrix + {i * n * WIDTH}"
+            lines += [f"factor = load({other} + {j * WIDTH}) * inverse", f"store({other} + {j * WIDTH}, factor)"]
+            for m in range(j + 1, end):
+                lines.append(f"store({other} + {m * WIDTH}, load({other} + {m * WIDTH}) - factor * p{m})")
+    return _made("factorise", lines)
 
 
 def own_templates(bindings: dict[str, Any]) -> dict[str, Callable[..., Any]]:

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from magpend_core import load_model, run_branches
+from magpend_core.engine import rosenbrock
 from magpend_core.engine.rosenbrock import implicit_bindings
 from magpend_core.engine.tableau import METHODS
 from magpend_core.engine.variational import with_parameter_tangent, with_tangents
@@ -272,3 +273,14 @@ def test_tangents__agree_with_variational_equations_of_another_integrator():
     monodromy = found.section[0, 0, 0, 2:].reshape(2, 2).T
     np.testing.assert_allclose(monodromy, other[2:].reshape(2, 2), atol=1e-8)
     assert np.abs(monodromy).max() > 1e-3
+
+
+@BOTH
+def test_loops__that_are_written_out_change_no_bit(equations, parameters, monkeypatch):
+    model, system = driven(equations, parameters)
+    starts = np.random.default_rng(5).uniform(0.1, 1.0, (5, len(equations)))
+    written = run(system, model.load().pack(), starts, 1.0)
+    monkeypatch.setattr(rosenbrock, "UNROLLED", 0)
+    looped = run(dataclasses.replace(system, name="looped"), model.load().pack(), starts, 1.0)
+    assert looped.section.tobytes() == written.section.tobytes()
+    assert (written.n_steps > 5).all()
