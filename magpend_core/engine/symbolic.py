@@ -30,8 +30,10 @@ class Symbol:
     def __init__(self, graph: Graph, node: Node) -> None:
         self.graph, self.node = graph, node
 
-    def __bool__(self) -> bool:
-        raise GraphError("the equations choose by an if, which has no derivative; write simd.where_less")
+    def _chosen(self, other: Any = None) -> bool:
+        raise GraphError("they choose by an if, which has no derivative; write simd.where_less")
+
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _chosen
 
     def __add__(self, other: Any) -> Symbol:
         return _made(self.graph.add, self, other)
@@ -213,7 +215,7 @@ def _called_plain(function: Callable[..., Any], *args: Any) -> Any:
     try:
         return plain(function, _substitutes())(*args)
     except (TypeError, AttributeError, NotImplementedError) as error:
-        raise GraphError(f"the equations do more than arithmetic: {error}") from error
+        raise GraphError(f"they do more than arithmetic ({error})") from error
 
 
 def implicit_problem(system: System) -> str | None:
