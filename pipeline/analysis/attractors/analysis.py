@@ -305,7 +305,7 @@ _SHOWN_BY = {
     "approach": "both sides come nearer",
     "volume": "volume preserved",
     "one_side": "one side comes nearer, the other leaves",
-    "step_limit": "no orbit found: Newton's method met the step limit; raise max_steps_per_period, or set rodas5p if the method is explicit",
+    "step_limit": "no orbit found: Newton's method met the step limit; raise max_steps_per_period, or set rodas5p",
     "no_return": "no orbit found: Newton's method lost the return; move the section, or raise section.longest",
     "no_convergence": "no orbit found: Newton's method did not converge; integrate longer, or with a smaller atol",
 }
