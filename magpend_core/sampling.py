@@ -13,6 +13,7 @@ from magpend_core.engine.checks import check_system
 from magpend_core.engine.driven import with_recorded_drive
 from magpend_core.engine.entry import N_LANES, check_tolerances, integrate, rtol_of_motion, slack_of
 from magpend_core.engine.observers import LIFT, MapSettings
+from magpend_core.engine.symbolic import check_implicit
 from magpend_core.engine.system import System
 from magpend_core.validation import check_array, check_count, check_states
 
@@ -198,6 +199,7 @@ def sample(
     """
     rtol, atol = check_tolerances(rtol, atol)
     rtol = rtol_of_motion(system, rtol)
+    check_implicit(system)
     packed = check_array("parameters", parameters, 2)
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     wanted = (len(initial), len(system.parameter_names))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,7 @@ def trajectory(
     rtol: float = RTOL,
     atol: float = ATOL,
     max_steps_per_period: int = MOST_STEPS,
+    method: str | None = None,
 ) -> np.ndarray:
     """Return the states of one trajectory on a time grid, started at the drive's rising edge.
 
@@ -43,12 +45,14 @@ def trajectory(
         Relative and absolute tolerance of the error control; `rtol` at least 1e-13.
     max_steps_per_period
         Limit on the attempted steps in one drive period.
+    method
+        ``"dopri5"``, or ``"rodas5p"`` for stiff equations; None for that of the model.
 
     Returns
     -------
     ndarray
         States at the times, in their units, shape (n, n_states); angles are not wrapped. Between steps the
-        values are those of the Dormand-Prince pair's continuous extension of order 4.
+        values are those of the method's continuous extension of order 4.
 
     Raises
     ------
@@ -58,7 +62,7 @@ def trajectory(
         If the trajectory diverges or meets the step limit before the last time; the message is
         the sentence of the `Status`.
     """
-    system = parameters.model.system
+    system = replace(parameters.model.system, method=method or parameters.model.method)
     frequency = float(check_frequency(frequency_hz, ndim=0))
     state = check_states(initial_state, 1, system.n_states, "initial_state")
     if system.is_map and frequency != 1.0:

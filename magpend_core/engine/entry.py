@@ -11,7 +11,7 @@ import numpy as np
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.lanes import Cells, engine_of
 from magpend_core.engine.observers import Observer
-from magpend_core.engine.symbolic import implicit_problem
+from magpend_core.engine.symbolic import check_implicit
 from magpend_core.engine.system import System
 from magpend_core.validation import check_array, check_count, check_frequency, check_states, check_tolerance
 
@@ -144,8 +144,7 @@ def integrate(
     watched = check_quantities(quantities, system)
     if watched and not system.tableau.is_continuous:
         raise ValueError(f"quantities are not watched with method {system.method!r}; choose dopri5 or rodas5p.")
-    if system.is_stiff and (problem := implicit_problem(system)):
-        raise ValueError(problem)
+    check_implicit(system)
     attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
     n_lanes = check_count("n_lanes", n_lanes, 1)
     frequency = check_frequency(frequency_hz, 2)

@@ -230,5 +230,11 @@ def implicit_problem(system: System) -> str | None:
     return None
 
 
+def check_implicit(system: System) -> None:
+    """Raise `ValueError` for a system of an implicit method that cannot be integrated by it."""
+    if system.is_stiff and (problem := implicit_problem(system)):
+        raise ValueError(problem)
+
+
 def _nodes(graph: Graph, values: Sequence[Any]) -> tuple[Node, ...]:
     return tuple(value.node if isinstance(value, Symbol) else graph.number(float(value)) for value in values)

@@ -56,6 +56,7 @@ def simulate(
     samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
     rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = RTOL,
     atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = ATOL,
+    method: Annotated[str, typer.Option(help="dopri5, or rodas5p for stiff equations.")] = "dopri5",
     out: Annotated[
         Path, typer.Option(help="Series: .csv, .nc (NetCDF), .mat (MATLAB) or .dat (a start of AUTO).")
     ] = Path("trajectory.csv"),
@@ -98,6 +99,7 @@ def simulate(
         samples_per_period=samples,
         rtol=rtol,
         atol=atol,
+        method=method,
     )
     ds = ds.assign_attrs(versions=json.dumps(versions()), **provenance())
     console.result(f"series: {save(ds, out)}")

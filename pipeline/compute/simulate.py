@@ -15,13 +15,13 @@ import numpy as np
 from magpend_core.defaults import ATOL, RTOL
 from magpend_core.engine.system import System
 from magpend_core.models import DEFAULT, load_model
-from magpend_core.models.model import Model, Quantity, State
+from magpend_core.models.model import Model, Quantity, State, by_method
 from magpend_core.models.presets import Preset
 from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.specification.recorded_drive import RecordedDrive, load_drive, model_problems
-from pipeline.specification.tables import FREQUENCY, RATES, Integration
+from pipeline.specification.tables import EXPLICIT, FREQUENCY, RATES, STIFF, Integration
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -138,13 +138,14 @@ FLOW_PERIODS = 50
 
 @dataclass(frozen=True)
 class Series:
-    """Settings of a time series: periods of the transient, periods shown, samples per period and tolerances."""
+    """Settings of a time series: periods of transient and series, samples per period, tolerances, method."""
 
     n_transient: int
     n_periods: int | None
     samples_per_period: int
     rtol: float
     atol: float
+    method: str
 
 
 def simulate(
@@ -160,6 +161,7 @@ def simulate(
     samples_per_period: int = 200,
     rtol: float = RTOL,
     atol: float = ATOL,
+    method: str = EXPLICIT,
 ) -> xr.Dataset:
     """Integrate one trajectory under the model's own or a recorded drive, and return it as a labelled time series.
 
@@ -183,6 +185,8 @@ def simulate(
         that a recorded drive has.
     rtol, atol
         Tolerances.
+    method
+        ``"dopri5"``, or ``"rodas5p"`` for stiff equations.
 
     Returns
     -------
@@ -205,13 +209,13 @@ def simulate(
     if drive is None and not chosen.clock.has_drive:
         frequency_hz = chosen.clock.default_hz if frequency_hz is None else frequency_hz
         n_periods = FLOW_PERIODS if n_periods is None else n_periods
-    series = Series(n_transient, n_periods, samples_per_period, rtol, atol)
+    series = Series(n_transient, n_periods, samples_per_period, rtol, atol, method)
     problems = _problems(series) + _state_problems(chosen, initial_state)
     frequency_hz, overrides = with_rate(frequency_hz, overrides or {}, chosen)
     recording = _recording(drive, frequency_hz, chosen, series, problems)
     try:
         found = chosen.preset(preset)
-        parameters = chosen.load(found, **overrides)
+        parameters = by_method(chosen, STIFF if method == STIFF else EXPLICIT).load(found, **overrides)
     except ParameterError as error:
         problems += error.problems
     if problems:
@@ -370,6 +374,8 @@ def _state_problems(model: Model, state: Sequence[float]) -> list[str]:
 
 def _problems(series: Series) -> list[str]:
     found: list[str] = []
+    if series.method not in (EXPLICIT, STIFF):
+        found.append(f"method = {series.method!r}: must be {EXPLICIT} or {STIFF}, which give states between steps.")
     try:
         # what a specification has too has its bounds there
         validated(Integration, {"rtol": series.rtol, "atol": series.atol, "n_transient": series.n_transient})

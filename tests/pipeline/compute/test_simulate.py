@@ -61,8 +61,19 @@ def test_simulate__all_problems_at_once():
             samples_per_period=0,
             rtol=float("nan"),
             atol=-1,
+            method="dop853",
         )
-    starts = ("frequency_hz", "rtol", "atol", "psi1", "n_transient", "n_periods", "samples", "'qq'")
+    starts = (
+        "method = 'dop853': must be dopri5 or rodas5p",
+        "frequency_hz",
+        "rtol",
+        "atol",
+        "psi1",
+        "n_transient",
+        "n_periods",
+        "samples",
+        "'qq'",
+    )
     assert len(caught.value.problems) == len(starts)
     for start in starts:
         assert any(p.startswith(start) for p in caught.value.problems)
@@ -262,3 +273,18 @@ def test_simulate__says_that_300_periods_are_too_few_and_that_1000_will_do():
     # independent of the sentence: two periods later the last section is there again
     last = np.stack([late[name].values[::20] for name in ("psi1", "psi2")])
     assert np.abs(last[:, 4] - last[:, 2]).max() < TOLERANCE < np.abs(last[:, 4] - last[:, 3]).max()
+
+
+@pytest.mark.slow
+def test_simulate__by_the_stiff_method_what_no_explicit_one_reaches():
+    equations = {"x": "v", "v": "mu*(1 - x**2)*v - x"}
+    model = {"name": "relaxation", "states": {"x": {}, "v": {}}, "parameters": {"mu": 1000.0}, "equations": equations}
+    options = {"model": model, "n_periods": 1, "samples_per_period": 50}
+    found = simulate(1.0 / 1500.0, (2.0, 0.0), method="rodas5p", **options)
+    from scipy.integrate import solve_ivp
+
+    def rates(t, y):
+        return y[1], 1000.0 * (1.0 - y[0] ** 2) * y[1] - y[0]
+
+    own = solve_ivp(rates, (0.0, 1500.0), (2.0, 0.0), "Radau", found.time.values, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found.x.values, own.y[0], atol=1e-5)
