@@ -175,6 +175,9 @@ def carry_out_all(works: Sequence[Work], *, workers: int | None, where: Where, e
     """Compute the missing tasks of several runs, as `carry_out` does for one; the workers share the tasks of all."""
     from pipeline.compute import clients
 
+    for work in works:
+        if work.plan.undecided:  # refuse a place where no run can be before cells are integrated for the decision
+            check(work.files, work.plan.identity)
     works = [work._replace(plan=decided(work.plan, echo)) for work in works]
     new = [work for work in works if check(work.files, work.plan.identity) is None]
     for work in new:

@@ -102,5 +102,5 @@ def test_run_branches__of_order_8_finds_crossings_and_carries_tangents():
     np.testing.assert_allclose(derivatives[0], derivatives[1], atol=1e-9)
     with pytest.raises(ValueError, match=r"method = 'rk4': \w+ can be integrated by dopri5, dop853"):
         run("duffing", "rk4", 1e-6, 1, some_starts(1))
-    with pytest.raises(ValueError, match="quantities are watched with method dopri5 alone"):
+    with pytest.raises(ValueError, match="quantities are not watched with method 'dop853'; choose dopri5 or rodas5p"):
         run("duffing", "dop853", 1e-6, 1, [[0.1, 0.0]], quantities=["energy"])
