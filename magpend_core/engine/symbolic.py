@@ -17,7 +17,7 @@ from magpend_core.engine.plain_python import plain
 from magpend_core.engine.system import System
 from magpend_core.expressions.derivatives import derivatives
 from magpend_core.expressions.graph import Graph, GraphError, Node
-from magpend_core.expressions.writer import SIMD, Writer
+from magpend_core.expressions.writer import SIMD, VECMATH, Writer
 from magpend_core.sizes import MAX_STATES
 
 
@@ -160,7 +160,7 @@ class _Traced:
         lines = ["u = _forcing(t, c)", "zero = 0.0 * y[0]", *writer.lines, f"return ({results})"]
         scope: dict[str, Any] = {"__name__": self.system.rhs.__module__, "_forcing": self.system.forcing}
         scope |= {name: getattr(simd, name) for name in SIMD}
-        scope |= {name: getattr(vecmath, name) for name in _WRITTEN}
+        scope |= {name: getattr(vecmath, name) for name in VECMATH}
         exec(f"def linearise({arguments}):\n    " + "\n    ".join(lines) + "\n", scope)
         return Linearised(inline(scope["linearise"]), tuple(entries), tuple(timed))
 
@@ -202,13 +202,6 @@ def curved(system: System) -> tuple[Linearised, Linearised]:
     traced = _traced(system)
     of_vector = traced.linearised(traced.along_vector(), "y, v, t, c")
     return of_vector, traced.linearised((traced.trace(),), "y, t, c")
-
-
-_WRITTEN = (
-    *("sincos", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "expm1", "log"),
-    *("power", "sign", "square_wave", "inverse_sqrt"),
-)
-"""Functions of `vecmath` that `Writer` writes."""
 
 
 def _called_plain(function: Callable[..., Any], *args: Any) -> Any:

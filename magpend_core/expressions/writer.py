@@ -11,7 +11,12 @@ from collections.abc import Iterable, Mapping
 from magpend_core.expressions.graph import STATED, Node, in_order
 
 SIMD = ("sqrt", "absolute", "minimum", "maximum", "copysign", "where_less", "multiply_add", "floor")
-"""What comes from `engine.simd`; other functions come from `engine.vecmath`."""
+"""What comes from `engine.simd`."""
+VECMATH = (
+    *("sincos", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "expm1", "log"),
+    *("power", "sign", "square_wave", "inverse_sqrt"),
+)
+"""What comes from `engine.vecmath`."""
 _NAMES = {"less": "where_less", "square": "square_wave"}
 
 

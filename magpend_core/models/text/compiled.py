@@ -9,7 +9,7 @@ from typing import Any
 from magpend_core.engine import simd, vecmath
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
-from magpend_core.expressions.writer import SIMD
+from magpend_core.expressions.writer import SIMD, VECMATH
 from magpend_core.models.text import runtime
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.derive import Derived
@@ -78,7 +78,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
 def _compiled(source: str) -> dict[str, Any]:
     """Execute generated source and return its compiled functions. The source can only do arithmetic."""
     scope: dict[str, Any] = {"__name__": _MODULE, "math_inf": math.inf}
-    for name in (*SIMD, *vecmath_names()):
+    for name in (*SIMD, *VECMATH):
         scope[name] = getattr(simd if name in SIMD else vecmath, name)
     for name in ("rank", "set_times", "within"):
         scope[name] = getattr(runtime, name)
@@ -88,28 +88,3 @@ def _compiled(source: str) -> dict[str, Any]:
     for name in [name for name in scope if name not in known and not name.startswith("__")]:
         scope[name] = inline(scope[name])
     return scope
-
-
-def vecmath_names() -> tuple[str, ...]:
-    """Return the names of the functions of `engine.vecmath` that expressions can need."""
-    wanted = (
-        "sincos",
-        "sin",
-        "cos",
-        "tan",
-        "asin",
-        "acos",
-        "atan",
-        "atan2",
-        "sinh",
-        "cosh",
-        "tanh",
-        "exp",
-        "expm1",
-        "log",
-        "power",
-        "sign",
-        "square_wave",
-        "inverse_sqrt",
-    )
-    return tuple(name for name in wanted if hasattr(vecmath, name))
