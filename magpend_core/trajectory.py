@@ -62,7 +62,9 @@ def trajectory(
         If the trajectory diverges or meets the step limit before the last time; the message is
         the sentence of the `Status`.
     """
-    system = replace(parameters.model.system, method=method or parameters.model.method)
+    system = parameters.model.system
+    if method is not None:
+        system = replace(system, method=method)
     frequency = float(check_frequency(frequency_hz, ndim=0))
     state = check_states(initial_state, 1, system.n_states, "initial_state")
     if system.is_map and frequency != 1.0:
