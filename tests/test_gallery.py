@@ -13,8 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq, fsolve
+from scipy.optimize import brentq
 
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.report import command_of
@@ -22,6 +21,7 @@ from pipeline.report.study import load_study
 from pipeline.specification.files import find_spec, shipped_workflows
 from pipeline.specification.problems import validated
 from pipeline.specification.spec import Spec
+from tests.core import collocation
 from tests.programs import ROOT, program
 
 PAGES = ROOT / "docs" / "gallery"
@@ -192,7 +192,7 @@ def axon_gates(v):
     """Opening and closing rates of Hodgkin and Huxley's gates m, h and n [1/ms], of the depolarisation [mV]."""
 
     def ratio(u):
-        return u / np.expm1(u) if u else 1.0
+        return np.divide(u, np.expm1(u), out=np.ones_like(u), where=u != 0.0)
 
     return (
         (ratio((25 - v) / 10), 4 * np.exp(-v / 18)),
@@ -215,8 +215,8 @@ def axon_at_rest(v):
     return state, -axon(state, 0.0)[0]
 
 
-def test_claims__hopf_points_of_the_axon():
-    """Hurwitz's determinant of order three vanishes there."""
+def axon_at_hopf(low, high):
+    """State and current at which Hurwitz's determinant of order three vanishes, between two depolarisations."""
 
     def determinant(v):
         state, current = axon_at_rest(v)
@@ -224,29 +224,37 @@ def test_claims__hopf_points_of_the_axon():
         _, a, b, c, d = np.poly(np.transpose(rows))
         return a * b * c - c * c - a * a * d
 
+    return axon_at_rest(brentq(determinant, low, high, xtol=1e-13))
+
+
+def test_claims__hopf_points_of_the_axon():
     for words, low, high in (("Rest loses", 4.0, 7.0), ("Firing ends", 20.0, 23.0)):
-        current = axon_at_rest(brentq(determinant, low, high, xtol=1e-13))[1]
+        _, current = axon_at_hopf(low, high)
         assert current == pytest.approx(claimed("hodgkin-huxley", words), abs=1e-5), words
 
 
 @pytest.mark.slow
-def test_claims__first_fold_of_the_axon():
-    """Among the cycles through v = 31.883 mV with a given n, the current is least at the fold."""
+def test_claims__folds_and_doublings_of_the_axon():
+    """By collocation, from the Hopf point on; on the way cycles grow like a canard, and a multiplier passes 6e8."""
+    unit = np.array([100.0, 1.0, 1.0, 1.0])
 
-    def mismatch(unknowns, n):
-        m, h, period, current = unknowns
-        start = [31.883, m, h, n]
-        ends = solve_ivp(lambda _, y: axon(y, current), (0.0, period), start, "DOP853", rtol=1e-11, atol=1e-12)
-        return ends.y[:, -1] - start
+    def rates(y, current):
+        return axon(y * unit[:, None], current) / unit[:, None]
 
-    step = 1e-4
-    found = [
-        fsolve(mismatch, [0.8634, 0.0692, 19.9, 6.2645], args=(0.746007 + k * step,), xtol=1e-13)[3] for k in (-1, 0, 1)
-    ]
-    bend, slope = found[0] - 2.0 * found[1] + found[2], 0.5 * (found[2] - found[0])
-    fold = found[1] - 0.5 * slope**2 / bend
-    assert fold == pytest.approx(6.2645213, abs=1e-7)
-    assert fold == pytest.approx(claimed("hodgkin-huxley", "Firing begins"), abs=5e-5)
+    state, current = axon_at_hopf(4.0, 7.0)
+    found = {"folds": [], "doublings": []}
+    first = collocation.near_hopf(rates, state / unit, current, size=1e-3, n_intervals=80)
+    for orbit, following in collocation.branch(rates, first, 0.01, 0.1, 60):
+        tests = {"folds": collocation.is_turning, "doublings": collocation.is_doubling(rates, orbit)}
+        for kind, function in tests.items():
+            if there := collocation.located(rates, orbit, following, function):
+                found[kind].append(there.parameter)
+    # the same with 160 intervals in place of 80, to 3e-9 and better
+    assert found["folds"] == pytest.approx([7.84654712019, 7.92198549435, 6.26452127452], abs=4e-9)
+    assert found["doublings"] == pytest.approx([7.84953739785, 7.92197767573], abs=4e-9)
+    claims = [claimed("hodgkin-huxley", words) for words in ("turn back", "cycles turn at", "Firing begins")]
+    assert found["folds"] == pytest.approx(claims, abs=5e-5)
+    assert found["doublings"][1] == pytest.approx(claimed("hodgkin-huxley", "they double"), abs=1e-6)
 
 
 def test_claims__hopf_points_of_the_oregonator():

@@ -298,8 +298,8 @@ def test_explore__cycles_whose_peak_is_a_removable_singularity():
     """The unstable cycles of Hodgkin and Huxley's model turn at I = 7.8465 and 7.9220, between two doublings
     (Guckenheimer and Oliva, SIAM J. Appl. Dyn. Syst. 1, 2002, 105); before, at 8.2337, their peak passes v = 10, where
     a rate is 0/0. Towards the second turn a multiplier passes -4e4, so that rounding decides what a whole period gives.
-    The folds agree with multiple shooting by scipy at rtol 1e-12 (7.84654712019, 7.92198549434); the last digits of
-    the doublings are magpend's own.
+    Collocation (`tests/test_gallery.py`) gives the folds 7.84654712019 and 7.92198549435, the doublings 7.84953739785
+    and 7.92197767573.
     """
     state, current = [3.5, 0.07794908, 0.4168789, 0.39370776], 9.278217390498842
     ds = followed(HODGKIN_HUXLEY, "v", state, "I", 7.84, 9.4, level=3.5, longest=100.0, I=current)
