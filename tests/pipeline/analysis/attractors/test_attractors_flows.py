@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from magpend_core.crossing import Crossing
 from pipeline.analysis.attractors.analysis import attractors_table
@@ -42,6 +43,23 @@ def test_identify__cycle_beside_equilibrium(value):
     assert found["stability"].values.tolist() == [ATTRACTS] * 2
     assert float(found["lyapunov_max"][orbit]) == 0.0
     assert float(found["lyapunov_max"][rest]) == pytest.approx(-0.1, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_identify__ranges_of_a_relaxation_oscillation():
+    """A jump of van der Pol's oscillator takes 1/7000 of the period, and the velocity has its peak within."""
+    mu = 100.0
+    relaxing = table("relaxing", {"x": "v", "v": "mu*(1 - x**2)*v - x"}, {"mu": mu})
+    found = identify(flow_cube(relaxing, [[1.5, 1.0]], crossing=Crossing("x", longest=400.0)))
+
+    def rates(_, u):
+        return [u[1], mu * (1.0 - u[0] ** 2) * u[1] - u[0]]
+
+    tops = [lambda t, u, i=i: rates(t, u)[i] for i in (0, 1)]
+    path = solve_ivp(rates, (0.0, 400.0), [2.0, 0.0], "Radau", rtol=1e-9, atol=1e-9, events=tops)
+    highest = [max(abs(states[1:, i])) for i, states in enumerate(path.y_events)]
+    for name, sign in (("state_max", 1.0), ("state_min", -1.0)):
+        assert found[name].values[0] == pytest.approx(np.multiply(sign, highest), rel=2e-3), name
 
 
 @pytest.mark.slow
