@@ -7,12 +7,12 @@ of the state is. A run keeps both in the text of its model, as the keys ``size``
 
 Both come from the later motion of some cells, so that wide starts do not hide a small attractor; a state that comes to
 rest keeps a share of the motion that led there. The motion is integrated with numpy as the text is written, in steps
-that are the same in any units and from any zero.
+that are the same in any units and from any zero; explicitly, or implicitly where that comes much farther.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,8 @@ ATTEMPTS = 400
 LEAVES_BY = 1.2
 """A state whose later motion leaves the range of the earlier one by this factor is on its way to somewhere else."""
 
+FARTHER = 10.0
+"""Factor by which implicit steps must come farther than as many explicit ones to be taken in their place."""
 
 LEAST_OF_MOTION = 0.1
 """Least share of the whole motion, or of the largest value, that counts: more than what errors of the steps move."""
@@ -111,7 +113,7 @@ def _measured(spec: Spec, model: TextModel) -> dict[str, tuple[float, tuple[floa
     n_periods = spec.integration.n_transient + spec.integration.n_keep
     motion, seconds = _Motion(model.definition, frequency, columns), n_periods / frequency
     with np.errstate(all="ignore"):
-        times, path = motion.path(y, seconds) if model.clock.is_continuous else motion.iterated(y, n_periods)
+        times, path = motion.followed(y, seconds) if model.clock.is_continuous else motion.iterated(y, n_periods)
         own = [(natural_size(*_size(times, np.abs(x))), _extent(times, x)) for x in path.transpose(1, 0, 2)]
     return dict(zip(model.state_names, own, strict=True))
 
@@ -159,8 +161,8 @@ def _range(values: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 class _Motion:
-    """The motion of some cells by the method of Bogacki and Shampine (Appl. Math. Lett. 2, 1989, 321), each with steps
-    of its own.
+    """The motion of some cells, each with steps of its own: by the method of Bogacki and Shampine (Appl. Math. Lett. 2,
+    1989, 321), or of a stiff system by that of Shampine and Reichelt (SIAM J. Sci. Comput. 18, 1997, 1, section 3.1).
     """
 
     def __init__(self, definition: Definition, frequency: np.ndarray, columns: Mapping[str, Any]) -> None:
@@ -176,8 +178,27 @@ class _Motion:
         rates = rates_of(self.definition, self._known(t, y))
         return np.array([np.broadcast_to(rate, t.shape) for rate in rates.values()], np.float64)
 
-    def path(self, y: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return times (step, cell) and states (step, state, cell) from the starts (state, cell) on.
+    def followed(self, y: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return times (step, cell) and states (step, state, cell) from the starts (state, cell) on, of the steps that
+        come farther.
+        """
+        times, path, h = self._path(y, ends, self._step)
+        jacobian, _ = self._derivatives(times[-1], path[-1], h, self._rates(times[-1], path[-1]))
+        fastest = np.abs(np.linalg.eigvals(jacobian)).max(axis=1)
+        if not (h * fastest > 1.0).any():  # stability allows 2.5, and a rejected step is halved
+            return times, path
+        far, other, _ = self._path(y, ends, self._implicit_step)
+        is_stiff = far[-1] > FARTHER * times[-1]
+        n = max(len(times), len(far))
+        times, far, path, other = (
+            np.pad(x, [(0, n - len(x))] + [(0, 0)] * (x.ndim - 1), "edge") for x in (times, far, path, other)
+        )
+        return np.where(is_stiff, far, times), np.where(is_stiff, other, path)
+
+    def _path(
+        self, y: np.ndarray, ends: np.ndarray, step: Callable[..., tuple[np.ndarray, ...]]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return times and states as `followed` does, and the lengths of the next steps, 0 at the end.
 
         A cell that has arrived at its end, or fails, stays where it is.
         """
@@ -196,7 +217,7 @@ class _Motion:
             h = np.minimum(h, ends - t)
             if not (h > 0.0).any():
                 break
-            after, k4, error = self._step(t, y, h, slope)
+            after, k4, error = step(t, y, h, slope)
             extent = np.fmax(high, after) - np.fmin(low, after)
             size = np.maximum(np.maximum(extent, least), LEAST_EXTENT * np.abs(y))
             worst = np.where(size > 0.0, error / (tolerance * size), 0.0).max(axis=0)
@@ -213,7 +234,37 @@ class _Motion:
             path.append(y)
         stuck = (h <= 1e-12 * longest) & (t < ends)
         path[-1] = np.where(stuck, np.nan, path[-1])
-        return np.array(times), np.array(path)
+        return np.array(times), np.array(path), np.minimum(h, ends - t)
+
+    def _implicit_step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the states after a step, the rates there, and the step's error."""
+        d, e = 1.0 / (2.0 + np.sqrt(2.0)), 6.0 + np.sqrt(2.0)
+        jacobian, by_time = self._derivatives(t, y, h, slope)
+        matrix = np.eye(len(y)) - (h * d)[:, None, None] * jacobian
+
+        def solved(right: np.ndarray) -> np.ndarray:
+            return np.asarray(np.linalg.solve(matrix, right.T[..., None])[..., 0].T)
+
+        k1 = solved(slope + h * d * by_time)
+        middle = self._rates(t + 0.5 * h, y + 0.5 * h * k1)
+        k2 = solved(middle - k1) + k1
+        after = y + h * k2
+        last = self._rates(t + h, after)
+        k3 = solved(last - e * (k2 - middle) - 2.0 * (k1 - slope) + h * d * by_time)
+        return after, last, np.abs(h * (k1 - 2.0 * k2 + k3) / 6.0)
+
+    def _derivatives(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return differences of the rates (state, cell): by the states (cell, state, state), by time (state, cell)."""
+        share = np.sqrt(np.finfo(float).eps)
+        units = np.maximum(np.abs(y), np.abs(h * slope))
+        columns = []
+        for i, unit in enumerate(np.where(units > 0.0, units, 1.0)):
+            moved = y.copy()
+            moved[i] += share * unit
+            columns.append((self._rates(t, moved) - slope) / (moved[i] - y[i]))
+        later = share * np.where(t == 0.0, 1.0 / self.frequency, t)
+        by_time = (self._rates(t + later, y) - slope) / later
+        return tuple(np.where(np.isfinite(x), x, 0.0) for x in (np.array(columns).transpose(2, 1, 0), by_time))
 
     def _step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the states after a step, the rates there, and the step's error."""

@@ -277,7 +277,7 @@ def _attractor_words(row: Row, n_points: int, model: Model) -> Words:
         "letter": letter(row["attractor_id"]),
         "id by": plain(row["match_basis"]) if n_points > 1 and "match_basis" in row else None,
     }
-    last = {"decided": ", ".join(decided), "shown by": _shown_by(row)}
+    last = {"decided": ", ".join(decided), "shown by": _shown_by(row, model)}
     place = _place(row, model)
     columns = state_columns(place, [*words, *last])
     return {**words, **{columns[name]: text for name, text in place.items()}, **last}
@@ -305,20 +305,21 @@ _SHOWN_BY = {
     "approach": "both sides come nearer",
     "volume": "volume preserved",
     "one_side": "one side comes nearer, the other leaves",
-    "step_limit": "no orbit found: Newton's method met the step limit; raise max_steps_per_period, or set rodas5p",
+    "step_limit": "no orbit found: Newton's method met the step limit; raise max_steps_per_period",
     "no_return": "no orbit found: Newton's method lost the return; move the section, or raise section.longest",
     "no_convergence": "no orbit found: Newton's method did not converge; integrate longer, or with a smaller atol",
 }
 
 
-def _shown_by(row: Row) -> str:
+def _shown_by(row: Row, model: Model) -> str:
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
         return f"{row['n_sampled']} stayed, lifetime above {low} {_confidence(row)}"
     if row["evidence"] == "left":
         high = number(row["lifetime_high"], ".0f")
         return f"{row['n_left']} of {row['n_sampled']} left, lifetime {low} to {high}"
-    return _SHOWN_BY[row["evidence"]]
+    words = _SHOWN_BY[row["evidence"]]
+    return f"{words}, or set rodas5p" if row["evidence"] == "step_limit" and model.method != "rodas5p" else words
 
 
 def _confidence(row: Row) -> str:

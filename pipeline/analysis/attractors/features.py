@@ -30,14 +30,12 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
+from pipeline.analysis.attractors.jumps import with_jumps
 from pipeline.analysis.flown import flown
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.results.sets import Geometry, hashes, mean_distance, order_of_points, rows_by_number
 from pipeline.results.sides import UNKNOWN
 from pipeline.results.tolerances import PORTRAIT_RTOL
-
-SHARES = 32
-"""Parts into which an interval between two instants of an orbit is divided where it is too long for its range."""
 
 ENERGY = "energy"
 """Name of the model's quantity whose range is computed for each attractor."""
@@ -193,85 +191,43 @@ def follow_orbits(
 def _follow(
     orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry, n_samples: int
 ) -> None:
-    per = orbits[0][1].model.clock.samples(n_samples)
-    times = [np.arange(period * per + 1) / (per * frequency) for _, _, frequency in orbits]
-    paths = _paths(orbits, period, times)
-    angles = np.flatnonzero(geometry.is_angle)
-    turns = [np.round((path[-1] - path[0])[angles] / TWO_PI) for path in paths]
-    for (found, parameters, _), path in zip(orbits, paths, strict=True):
+    flows = [of_flow(parameters) for _, parameters, _ in orbits]
+    model, angles = flows[0].model, np.flatnonzero(geometry.is_angle)
+    per = model.clock.samples(n_samples)
+    even = [np.arange(period * per + 1) / (per * frequency) for _, _, frequency in orbits]
+
+    def fly(rows: list[int], times: list[np.ndarray]) -> list[np.ndarray]:
+        found = sample(
+            model.system,
+            np.array([flows[row].pack() for row in rows]),
+            np.array([orbits[row][0].points[0] for row in rows]),
+            times,
+            drives=[Drive(np.full(period, 1.0 / orbits[row][2])) for row in rows],
+            **tolerances_at(PORTRAIT_RTOL),
+            max_steps_per_interval=limits_at(PORTRAIT_RTOL)["max_steps_per_period"],
+            limits_first_step=False,
+        )
+        if (found.status != Status.BOUNDED).any():
+            raise ArithmeticError(f"An orbit ended early: {Status(found.status.max()).advice}.")
+        return [states[: len(own)] for states, own in zip(found.states, times, strict=True)]
+
+    times = even.copy()
+    paths = (
+        with_jumps(fly, times, model.system.sizes) if model.clock.is_continuous else fly([*range(len(orbits))], times)
+    )
+    for row, (found, parameters, frequency) in enumerate(orbits):
+        path = paths[row]
+        turns = np.round((path[-1] - path[0])[angles] / TWO_PI)
+        found.rotation = turns / period + 0.0  # no -0.0
+        found.state_min, found.state_max = path.min(axis=0), path.max(axis=0)
+        rotating = angles[turns != 0]
+        found.state_min[rotating], found.state_max[rotating] = -np.pi, np.pi
+        _fill_energy(found, times[row], path, flows[row], frequency)
         mirror = parameters.model.mirror
         if mirror is not None:
             first = n_samples // 2 if mirror.half_period else 0
-            found.image = path[first : period * per : per] * np.array(mirror.signs)
-    if orbits[0][1].model.clock.is_continuous:
-        _sharpen(orbits, period, times, paths)
-    for row, (found, parameters, frequency) in enumerate(orbits):
-        found.rotation = turns[row] / period + 0.0  # no -0.0
-        found.state_min, found.state_max = paths[row].min(axis=0), paths[row].max(axis=0)
-        rotating = angles[turns[row] != 0]
-        found.state_min[rotating], found.state_max[rotating] = -np.pi, np.pi
-        _fill_energy(found, times[row], paths[row], of_flow(parameters), frequency)
-
-
-def _paths(
-    orbits: Sequence[tuple[Features, Parameters, float]], period: int, times: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Return the states of orbits at instants of each."""
-    flows = [of_flow(parameters) for _, parameters, _ in orbits]
-    found = sample(
-        flows[0].model.system,
-        np.array([flow.pack() for flow in flows]),
-        np.array([found.points[0] for found, _, _ in orbits]),
-        times,
-        drives=[Drive(np.full(period, 1.0 / frequency)) for _, _, frequency in orbits],
-        **tolerances_at(PORTRAIT_RTOL),
-        max_steps_per_interval=limits_at(PORTRAIT_RTOL)["max_steps_per_period"],
-        limits_first_step=False,
-    )
-    if (found.status != Status.BOUNDED).any():
-        raise ArithmeticError(f"An orbit ended early: {Status(found.status.max()).advice}.")
-    return [states[: len(own)] for states, own in zip(found.states, times, strict=True)]
-
-
-def _sharpen(
-    orbits: Sequence[tuple[Features, Parameters, float]], period: int, times: list[np.ndarray], paths: list[np.ndarray]
-) -> None:
-    """Add instants to orbits where they are too few for their ranges, as on the jumps of a relaxation oscillation."""
-    rounds = 5  # each divides an interval by `SHARES`
-    rows, sizes = list(range(len(orbits))), np.array(orbits[0][1].model.system.sizes)
-    for _ in range(rounds):
-        coarse = {row: _is_coarse(paths[row], sizes) for row in rows}
-        rows = [row for row in rows if coarse[row].any()]
-        if not rows:
-            return
-        for row in rows:
-            times[row] = _divided(times[row], coarse[row])
-        found = _paths([orbits[row] for row in rows], period, [times[row] for row in rows])
-        for row, path in zip(rows, found, strict=True):
-            paths[row] = path
-
-
-def _is_coarse(path: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Tell the intervals between states along a path (n, n_states) on which a state changes by much of its range, or
-    that adjoin its least or its largest value and are not flat.
-    """
-    much, flat = 1 / 8, 1 / 64  # shares of the range; a parabola is at most a quarter of the second above its samples
-    rounding = 1e-6  # range, relative to the largest value, that may be errors of the steps
-    least = rounding * np.maximum(np.abs(path).max(axis=0), sizes)
-    share = np.abs(np.diff(path, axis=0)) / np.maximum(np.ptp(path, axis=0), least)
-    coarse = (share > much).any(axis=1)
-    for k, column in enumerate(path.T):
-        for at in (int(column.argmin()), int(column.argmax())):
-            beside = slice(max(at - 1, 0), at + 1)
-            coarse[beside] |= share[beside, k] > flat
-    return np.asarray(coarse)
-
-
-def _divided(times: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Return instants with others between them in the intervals that are chosen."""
-    begins, lengths = times[:-1][where], np.diff(times)[where]
-    between = begins[:, None] + lengths[:, None] * (np.arange(1, SHARES) / SHARES)
-    return np.sort(np.append(times, between))
+            at = np.searchsorted(times[row], even[row][first : period * per : per])
+            found.image = path[at] * np.array(mirror.signs)
 
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:

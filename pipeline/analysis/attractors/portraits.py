@@ -13,6 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
+from pipeline.analysis.attractors.jumps import with_jumps
 from pipeline.layout.vocabulary import APERIODIC, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, told_by
 from pipeline.results.ragged import dense
 from pipeline.results.selection import choose, start_dims
@@ -48,8 +49,9 @@ def portraits(
     -------
     Dataset
         Dim ``attractor`` runs over the sets present at the point. ``orbit`` (attractor, sample, state) has
-        the states at equal times from a section on, `n_samples` per drive period or return; angles are not
-        wrapped, and samples beyond the end (for an equilibrium, after the first) are NaN. ``points``
+        the states at the instants ``time`` (attractor, sample) from a section on, `n_samples` per drive period or
+        return, and more where a state jumps; angles are not wrapped, and samples beyond the end (for an
+        equilibrium, after the first) are NaN. ``points``
         (attractor, sample, place, axis) has the moving points of the model's drawing, ``x`` to the right and
         ``y`` upwards, in the drawing's unit; ``fixed`` (fixed_place, axis) has the points that do not move.
         Both are absent if the model has no drawing. ``attractor_points``, ``share``, ``n_cells``,
@@ -73,7 +75,7 @@ def portraits(
     base = base.replace(**{k: v for k, v in values.items() if k in base})
     step = _step(here, base, frequency_of(base.model, values), n_samples)
     orbits = [_orbit(here.isel(attractor=i), base, step, n_samples, n_periods) for i in range(here.sizes["attractor"])]
-    return _dataset(here, orbits, base, step)
+    return _dataset(here, orbits, base)
 
 
 def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples: int) -> float:
@@ -112,23 +114,33 @@ def mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) ->
     return found if np.isfinite(found) else 0.1 / frequency
 
 
-def _orbit(one: xr.Dataset, parameters: Parameters, step: float, n_samples: int, n_periods: int) -> np.ndarray:
+def _orbit(
+    one: xr.Dataset, parameters: Parameters, step: float, n_samples: int, n_periods: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return instants and the states there."""
     start = one["attractor_points"].transpose("point", "state").values[0]
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     n = n_samples * (periods if kind == PERIODIC_ORBIT else n_periods)
     if kind == EQUILIBRIUM:
-        return np.asarray(start[None])
+        return np.zeros(1), np.asarray(start[None])
     if kind == PERIODIC_ORBIT and (parameters.model.crossing is not None or not periods):
         n = math.ceil(float(one["period_s"]) / step)
-    times = np.arange(n + 1) * step
-    return trajectory(of_flow(parameters), 1.0 / (step * n_samples), start, times, **tolerances_at(PORTRAIT_RTOL))
+    flow = of_flow(parameters)
+
+    def fly(_: list[int], times: list[np.ndarray]) -> list[np.ndarray]:
+        return [trajectory(flow, 1.0 / (step * n_samples), start, times[0], **tolerances_at(PORTRAIT_RTOL))]
+
+    times = [np.arange(n + 1) * step]
+    (states,) = with_jumps(fly, times, flow.model.system.sizes)
+    return times[0], states
 
 
-def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters, step: float) -> xr.Dataset:
-    length = max((len(o) for o in orbits), default=0)
+def _dataset(here: xr.Dataset, orbits: list[tuple[np.ndarray, np.ndarray]], parameters: Parameters) -> xr.Dataset:
+    length = max((len(times) for times, _ in orbits), default=0)
+    instants = np.full((len(orbits), length), np.nan)
     table = np.full((len(orbits), length, len(parameters.model.states)), np.nan)
-    for row, orbit in zip(table, orbits, strict=True):
-        row[: len(orbit)] = orbit
+    for row, (times, states) in enumerate(orbits):
+        instants[row, : len(times)], table[row, : len(times)] = times, states
     keep = ["attractor_points", "share", "n_cells", "orbit_period", "kind", "stability", "side"]
     result = here[[name for name in keep if name in here]].assign(
         orbit=(
@@ -137,8 +149,8 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
             {"units": "see state_units", "long_name": "motion on the attractor"},
         )
     )
-    time = np.arange(length) * step
-    result = result.assign_coords(time=("sample", time, {"units": "s", "long_name": "time"}))
+    about = {"units": "s", "long_name": "time"}
+    result = result.assign_coords(time=(("attractor", "sample"), instants, about))
     result.attrs = {**told_by(here.attrs), "title": "portraits of attractors"}
     return _drawn(result, table, parameters)
 

@@ -116,6 +116,17 @@ def test_with_sizes__wide_starts_do_not_hide_a_small_attractor():
     assert high - low == pytest.approx(0.1 * 5.0, rel=0.01)  # a tenth of the whole motion at most
 
 
+def test_with_sizes__a_stiff_motion_counts_its_jumps():
+    """Van der Pol's oscillator (mu = 1000) leaves 2 at a rate of 1/1500 1/s, while explicit steps are 1/1200 s."""
+    spec = spec_of("cycle").as_dict()
+    spec["model"] = {**spec["model"], "equations": {"x": "v", "v": "1e3*(1 - x**2)*v - x"}}
+    spec["parameters"] = {"frequency_hz": 1e-2}
+    spec["initial_conditions"] = {"kind": "list", "points": [[2.0, 0.0]]}
+    (low, high), speed = measures(Spec.parse(spec))
+    assert (low, high) == pytest.approx((-2.0, 2.0), abs=0.1)
+    assert np.ptp(speed) > 1e3
+
+
 @pytest.mark.parametrize(("given", "message"), [([1.0], "two numbers"), ([2.0, 1.0], "below the second")])
 def test_motion_of_a_state__is_checked(given, message):
     with pytest.raises(SpecError, match=message):

@@ -118,6 +118,6 @@ def test_chaos__by_the_zero_one_test(chaotic, strange):
     assert found["median_zero_one"].item() > 0.95
     # 1.37 from 1e4 points
     assert found["attractor_correlation"].item() == pytest.approx(1.35, abs=0.15)
-    found = portraits(strange, n_periods=2, n_samples=16)
-    assert found["orbit"].shape == (1, 33, 2)
+    found = portraits(strange, n_periods=2)
+    assert found["orbit"].shape == (1, 513, 2)
     assert "points" not in found
