@@ -41,6 +41,9 @@ LEAVES_BY = 1.2
 FARTHER = 10.0
 """Factor by which implicit steps must come farther than as many explicit ones to be taken in their place."""
 
+MOST_IMPLICIT = 16
+"""Most states of a system whose motion may be followed implicitly: an implicit step takes a rate for each of them."""
+
 LEAST_OF_MOTION = 0.1
 """Least share of the whole motion, or of the largest value, that counts: more than what errors of the steps move."""
 
@@ -183,6 +186,8 @@ class _Motion:
         come farther.
         """
         times, path, h = self._path(y, ends, self._step)
+        if len(y) > MOST_IMPLICIT:
+            return times, path
         jacobian, _ = self._derivatives(times[-1], path[-1], h, self._rates(times[-1], path[-1]))
         fastest = np.abs(np.linalg.eigvals(jacobian)).max(axis=1)
         if not (h * fastest > 1.0).any():  # stability allows 2.5, and a rejected step is halved
