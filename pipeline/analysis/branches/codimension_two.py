@@ -33,7 +33,7 @@ from itertools import combinations
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings
+from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.bifurcations import Tested, find_root
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps
@@ -109,8 +109,9 @@ class Detector:
         _, frame, before = self._last
         turned, after = yield from self._tests(b, frame)
         for kind, value in before.items():
-            if value * after[kind] < 0.0:
-                yield from self._locate(kind, (a, value), (b, after[kind]), frame)
+            ends = (a, value), (b, after[kind])
+            if value * after[kind] < 0.0 and (yield from self._is_certain(kind, ends, frame)):
+                yield from self._locate(kind, *ends, frame)
         self._last = b, turned, after
         return True
 
@@ -131,9 +132,36 @@ class Detector:
             _, _, self._level = settled(value.residual)
         if self._level < 0:
             return float("nan")
-        case.steps = STEPS[self._level : self._level + 2]
-        value = yield Query(CoefficientProblem(case), case.u)
-        return float(value.residual[0])
+        for level in range(self._level, len(STEPS) - 1):
+            case.steps = STEPS[level : level + 2]
+            if _crosses_beside(case):
+                value = yield Query(CoefficientProblem(case), case.u)
+                return float(value.residual[0])
+        return float("nan")
+
+    def _is_certain(self, kind: str, ends: Sequence[Tested], frame: _Frame) -> Steps[bool]:
+        """Return whether the signs of a test function are known at points of a curve. At a fold of limit cycles its
+        coefficient is compared with the residual, both in units of the cycle's size: where the cycle shrinks to an
+        equilibrium the coefficient vanishes, and any point nearby is a fold within the residual.
+        """
+        least = 10.0  # coefficient in units of the residual: less moves the fold by a third of the cycle's size
+        family = self.problem.family
+        if kind != CUSP or not family.period or family.system.section is None:
+            return True
+        for point, value in ends:
+            for settings in self.settings:
+                fine = yield from correct(self.problem, point.u, point.tangent, settings)
+                if fine is not None:
+                    break
+            else:
+                return False
+            again = yield from self._test(kind, frame, fine)
+            _, rates = family.crossing_speeds(fine.u[None])
+            size = float(np.abs(rates).max()) * fine.value.seconds / (2.0 * np.pi)
+            residual = settings.tolerance * max(1.0, 1.0 / size)
+            if not again * np.sign(value) * size > least * residual:
+                return False
+        return True
 
     def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[None]:
         """Locate and store the point of codimension two where a test function vanishes between two points of a curve;
@@ -173,6 +201,17 @@ class Detector:
             return one
         cosine = _cosine(np.linalg.eigvals(one.point.value.monodromy))
         return replace(one, kind=R1 if cosine > 0.0 else R2) if abs(cosine) >= 1.0 - on_axis else None
+
+
+def _crosses_beside(case: Case) -> bool:
+    """Return whether states beside an orbit cross the section about as fast as the orbit. Near or beyond the
+    equilibrium to which a limit cycle shrinks they do not: differences over it are no derivatives of the return map.
+    """
+    slowest = 0.25  # speed across the section, in units of the orbit's
+    if case.family.system.section is None:
+        return True
+    own, *beside = case.family.crossing_speeds(np.concatenate([case.u[None], case.neighbours()]))[0]
+    return bool(min(beside) > slowest * own)
 
 
 def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:

@@ -9,7 +9,6 @@ from itertools import product
 import numpy as np
 
 from magpend_core.poincare import Section
-from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, crawls, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstable, settle_sides
 from pipeline.analysis.branches.kinds import FOLD, LIMITS
@@ -146,26 +145,38 @@ def end_of_crossings(family: Family, point: Point) -> str:
     """Return why a limit cycle cannot be followed on its Poincare section: ``tangent`` or ``equilibrium``; empty if it
     can be.
     """
-    # crossing speed times the period below which the branch ends [scales of the states]; there the cycle has shrunk to
-    # an equilibrium if this product is below `rest` for all states
+    # crossing speed times the period below which a branch may end, and the largest such product of a state that is at
+    # rest there [scales of the states]
     touching, rest = 0.01, 0.5
+    # least crossing speed times the period, in units of the cycle's extent across the section, of a cycle that shrinks:
+    # pi on an ellipse whose centre is on the section, much less where a large cycle touches it or passes a saddle
+    shrinks = 0.5
     if family.system.section is None:
         return ""
     across, most = _reach(family, point)
     if across >= touching:
         return ""
-    return "equilibrium" if most < rest else "tangent"
+    if most >= rest:
+        return "tangent"
+    if abs(across) >= shrinks * _extent(family, point):
+        return "equilibrium"
+    return "tangent" if across * rest < touching * most else ""
 
 
 def _reach(family: Family, point: Point) -> tuple[float, float]:
     """Return the crossing speed of a cycle times its period, positive in the section's direction, and the largest such
     product of all states [scales of the states].
     """
-    section, rows = Section(family.system), family.rows(point.u[None])
-    rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)[0]
-    reach = rates * point.value.seconds / np.asarray(family.system.scales)
-    (normal,), _ = section.scaled_normals(rows.states, rows.parameters)
-    return float(section.sign * (normal @ reach)), float(np.abs(reach).max())
+    (speed,), (rates,) = family.crossing_speeds(point.u[None])
+    return float(speed * point.value.seconds), float(np.abs(rates * point.value.seconds).max())
+
+
+def _extent(family: Family, point: Point) -> float:
+    """Return the extent of a cycle across the section [scales of the states]."""
+    rows = family.rows(point.u[None])
+    (normal,), _ = Section(family.system).scaled_normals(rows.states, rows.parameters)
+    states = last_orbit(family, point, RestSettings())
+    return float(np.ptp(states / np.asarray(family.system.scales) @ normal))
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:

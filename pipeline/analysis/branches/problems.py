@@ -18,6 +18,8 @@ from magpend_core.engine.system import System
 from magpend_core.models.model import Model
 from magpend_core.orbits import wrap_angles
 from magpend_core.plain_rates import plain_rates
+from magpend_core.poincare import Section
+from magpend_core.pointwise import rates_packed
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 
 FREQUENCY = FREQUENCY_DIM
@@ -173,6 +175,16 @@ class Family:
             else:
                 packed[:, self.system.parameter_names.index(name)] = column
         return Rows(many[:, :n] * np.asarray(self.system.scales), frequency, packed, self.period)
+
+    def crossing_speeds(self, many: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the speeds across the section at its points (m,), positive in its direction, and the rates of the
+        states (m, n_states), both scaled [1/s].
+        """
+        section, rows = Section(self.system), self.rows(many)
+        rates = rates_packed(self.system, rows.states, rows.parameters, rows.frequency_hz)
+        rates = rates / np.asarray(self.system.scales)
+        normals, _ = section.scaled_normals(rows.states, rows.parameters)
+        return section.sign * (normals * rates).sum(axis=1), rates
 
     def mismatch(self, u: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Compute the scaled difference between the unknowns' section point and its image after one period, with

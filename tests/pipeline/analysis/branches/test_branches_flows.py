@@ -161,6 +161,30 @@ def test_explore__towards_a_homoclinic_orbit():
     assert "branch 0 at" not in str(ds.attrs["left_out"])
 
 
+def ends_of(ds):
+    """Names of the two ends of the first branch."""
+    names = str(ds["first_end"].attrs["flag_meanings"]).split()
+    return [names[int(ds[end][0])] for end in ("first_end", "last_end")]
+
+
+def test_explore__towards_a_saddle_on_the_section():
+    """On y = 0 the cycles of the same branch slow down beside the saddle, though they stay as large as the loop."""
+    ds = followed(HOMOCLINIC, "y", [0.15, 0.0], "alpha", -0.1, 0.1, level=0.0, alpha=0.05)
+    assert ends_of(ds) == ["homoclinic", "bound"]
+    assert np.nanmin(ds["section"].values[0, :, 0, 0]) < 1e-5
+    (row,) = table_of(ds)
+    assert abs(row["alpha"]) < 2.0 * row["bracket"] < 1e-8
+    assert row["saddle_quantity"] == pytest.approx(-2.0, abs=1e-8)
+
+
+@pytest.mark.parametrize(("level", "end"), [(0.05, "tangent"), (0.02, "tangent"), (0.0, "equilibrium")])
+def test_explore__a_touch_is_no_equilibrium(level, end):
+    """Cycles with the squared radius mu touch the section where the radius is its distance from the equilibrium."""
+    ds = followed(HOPF, "y", [np.sqrt(0.25 - level**2), level], "mu", -0.2, 0.5, level=level)
+    assert ends_of(ds) == [end, "bound"]
+    assert np.nanmin(ds["parameter"].values[0]) == pytest.approx(level**2, abs=1e-5)
+
+
 MORRIS_LECAR = table(
     "morris_lecar",
     {"v": "y - 0.5*(v + 0.5) - 2*w*(v + 0.7) - m*(v - 1)", "w": "1.15*(winf - w)*tau"},

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
+from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches import codimension_two
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.curves import continue_curves, curves_dataset
@@ -13,7 +15,7 @@ from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
-from tests.core.flows import table
+from tests.core.flows import model_of, table
 
 # z' = (1 + i w0) z - |z|^2 z + F exp(i W t) for z = x + i y
 STUART_LANDAU = load_model(
@@ -146,6 +148,24 @@ def test_duffing__cusp():
     assert kind == "cusp"
     assert 2.0 * np.pi * value[0] == pytest.approx(1.0901095, abs=1e-7)
     assert value[1] == pytest.approx(0.0513635, abs=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("q", "share"), [(0.1, 0.5), (0.1, 1 / 6), (0.3, 0.6), (0.03, 0.5)])
+def test_cusp_of_cycles__none_where_they_shrink(q, share):
+    """mu + c s + q s^2 - s^3 = 0 with the squared radius s: a cusp at s = q/3, and the folds end with s = 0."""
+    rates = {"x": "g*x - 2*y", "y": "2*x + g*y"}
+    define = {"s": "x^2 + y^2", "g": "mu + c*s + q*s^2 - s^3"}
+    model = sectioned(model_of(rates, {"mu": 0.0, "c": 0.0, "q": 0.3}, define=define), Crossing("y", longest=50.0))
+    bounds = ((-2.0 * q**3, 2.0 * q**3), (-2.0 * q**2, 2.0 * q**2))
+    scales = tuple(high - low for low, high in bounds)
+    family = Family(model.system, 1, model.crossing.frequency_hz, model.load(q=q).pack(), ("mu", "c"), scales)
+    s = share * q
+    c = 3.0 * s**2 - 2.0 * q * s
+    u = family.unknowns(np.array([np.sqrt(s), 0.0]), [s**3 - q * s**2 - c * s, c])
+    ((kind, value),) = located(continue_curves([(0, family, "fold", u)], bounds))
+    assert kind == "cusp"
+    np.testing.assert_allclose(value, [q**3 / 27.0, -(q**2) / 3.0], rtol=1e-6)
 
 
 @pytest.mark.slow

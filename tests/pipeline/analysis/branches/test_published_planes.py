@@ -4,12 +4,16 @@ Bykov, Yablonskii and Kim, Dokl. Akad. Nauk SSSR 242 (1978) 637; its points in M
 bifurcations of equilibria. Kuznetsov, Meijer and van Veen, Int. J. Bifurcation Chaos 14 (2004) 2253.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from pipeline.analysis.branches.curves import continue_curves
+from magpend_core.crossing import Crossing
+from magpend_core.models.sectioned import sectioned
+from pipeline.analysis.branches.curves import CURVE, continue_curves
 from pipeline.analysis.branches.equilibrium_curves import EquilibriumCurve
 from pipeline.analysis.branches.homoclinic import HomoclinicSettings
 from pipeline.analysis.branches.homoclinic_curves import homoclinic_curves, loops_beside
@@ -105,17 +109,18 @@ def known(rates, one):
     return fsolve(conditions, np.append(one.family.state(one.point.u), one.values) + 1e-4, xtol=1e-13)[n:]
 
 
-def curves_of(model, rates, kind, state, values, free, bounds):
+def curves_of(model, rates, kind, state, values, free, bounds, generations=1):
     """Follow a curve of equilibria, from the equilibrium near a state."""
-    family = Family(model.system, 0, 1.0, model.load().pack(), free, tuple(high - low for low, high in bounds))
+    rate, scales = model.crossing.frequency_hz if model.crossing else 1.0, tuple(high - low for low, high in bounds)
+    family = Family(model.system, 0, rate, model.load().pack(), free, scales)
     rest = fsolve(rates, state, tuple(values), xtol=1e-12)
     start = EquilibriumCurve(family, kind).start(family.unknowns(rest, values))
-    return continue_curves([(0, family, kind, start)], bounds, generations=1)
+    return continue_curves([(0, family, kind, start)], bounds, generations=generations)
 
 
-def oxidation_curves():
-    free, bounds = ("q2", "K"), ((0.7, 1.5), (0.1, 1.2))
-    return curves_of(OXIDATION, oxidation, "fold", [0.0247, 0.4503, 0.375], [1.0522, 0.4], free, bounds), bounds
+def oxidation_curves(model=OXIDATION, bounds=((0.7, 1.5), (0.1, 1.2)), generations=1):
+    free, start = ("q2", "K"), ([0.0247, 0.4503, 0.375], [1.0522, 0.4])
+    return curves_of(model, oxidation, "fold", *start, free, bounds, generations), bounds
 
 
 def specials(curves, kind):
@@ -136,6 +141,26 @@ def test_oxidation__published():
     assert len(hopf) == 2
     for one in hopf:
         np.testing.assert_allclose(one.values, known(oxidation, one), atol=1e-7)
+
+
+@pytest.mark.slow
+def test_oxidation__folds_of_cycles():
+    """From a generalised Hopf point q2 rises along the curve, so that it has no cusp, whatever orbit it starts from."""
+    seen = sectioned(OXIDATION, Crossing("x - y", longest=1000.0))
+    curves, bounds = oxidation_curves(seen, ((0.85, 1.43), (0.2, 1.0)), generations=2)
+    assert [one.family.period for one in specials(curves, "cusp")] == [0]
+    (cycles,) = (curve for curve in curves if curve.kind == "fold" and curve.family.period)
+    hopf = min(specials(curves, "generalised_hopf"), key=lambda one: np.abs(one.values - cycles.values[0]).max())
+    np.testing.assert_allclose(cycles.values[0], hopf.values, atol=1e-4)
+    short = replace(CURVE, max_points=25)
+    starts = [[(0, cycles.family, "fold", p.u)] for p in cycles.points[:20:4]]
+    again = [curve for start in starts for curve in continue_curves(start, bounds, short, generations=0)]
+    assert len(again) == len(starts)
+    for curve in (cycles, *again):
+        rises = np.diff(curve.values[:, 0]) * np.sign(curve.values[-1, 0] - curve.values[0, 0])
+        assert (rises > 0.0).all()
+        assert not curve.special
+        assert not curve.n_missed
 
 
 @pytest.mark.slow
