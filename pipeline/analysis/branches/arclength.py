@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -67,6 +68,11 @@ class Point:
     def residual(self) -> float:
         """Largest scaled residual of the equations at this point."""
         return float(np.abs(self.value.residual).max())
+
+    @cached_property
+    def determinant(self) -> float:
+        """Determinant of the derivative and the tangent, which vanishes where curves cross."""
+        return float(np.linalg.det(np.vstack([self.value.derivative, self.tangent])))
 
 
 @dataclass(eq=False)

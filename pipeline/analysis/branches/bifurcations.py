@@ -59,10 +59,6 @@ def _margin(point: Point) -> float:
     return float(np.abs(np.abs(values) - 1.0).min())
 
 
-def _branching_test(point: Point) -> float:
-    return float(np.linalg.det(np.vstack([point.value.derivative, point.tangent])))
-
-
 def _doubling_test(point: Point) -> float:
     if point.value.is_rest:
         return 1.0
@@ -74,7 +70,7 @@ TESTS: dict[str, Test] = {
     FOLD: lambda point: float(point.tangent[-1]),
     DOUBLING: _doubling_test,
     TORUS: lambda point: 1.0 if point.value.is_rest else torus_product(point.value.multipliers),
-    BRANCHING: _branching_test,
+    BRANCHING: lambda point: point.determinant,
     HOPF: lambda point: hopf_test(point.value.multipliers) if point.value.is_rest else 1.0,
 }
 """Functions of a point that change their sign at a bifurcation.
@@ -100,6 +96,7 @@ class Bifurcation:
     # period doubling or pitchfork tells it as well: `CONTRADICTORY` if the two disagree.
     criticality: str = ""
     child: Any = None  # the other branch through it, if that is known
+    stuck: Any = None  # the beginning of its doubled branch, if that could not be followed
     # normal form coefficient and its error (see `normal_forms`); NaN if unknown
     coefficient: float = np.nan
     coefficient_error: float = np.nan

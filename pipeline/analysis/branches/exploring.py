@@ -21,7 +21,7 @@ from magpend_core.orbits import section_map
 from magpend_core.poincare import Section, section_of
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
-from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct
 from pipeline.analysis.branches.bifurcations import SAME_PLACE, TESTS, Bifurcation, locate, settle_sides
 from pipeline.analysis.branches.following import (
     Branch,
@@ -50,6 +50,10 @@ POINTS_BESIDE = 3
 """Points of a branch away from a bifurcation at which it is seen on which side of it the branch lies."""
 
 
+LEAST_POINTS = 5
+"""Points below which a doubled branch that is stuck is no branch: it is named among those left out."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scope:
     """Limits within which branches are explored: parameter interval, longest period, number of generations."""
@@ -72,13 +76,16 @@ class _Doubled:
 
     scope: Scope
     _located: dict[Value, tuple[Family, Bifurcation]] = field(default_factory=dict)  # by its orbit; nothing begun
-    _begun: dict[Value, Begun[Half | None]] = field(default_factory=dict)
+    _begun: dict[Value, Begun[Half]] = field(default_factory=dict)
     _latest: dict[OrbitProblem, np.ndarray] = field(default_factory=dict)  # unknowns on each branch
 
-    def half(self, family: Family, start: Point, from_bifurcation: bool = False) -> Steps[Half]:
-        """Follow one half of a branch, and note the period doublings on it."""
+    def half(self, family: Family, start: Point, single: Point | None = None) -> Steps[Half]:
+        """Follow one half of a branch, and note the period doublings on it; `single` is the orbit at whose doubling it
+        starts.
+        """
         low, high, settings = self.scope.low, self.scope.high, self.scope.settings
-        return half_branch(family, start, low, high, settings, from_bifurcation, partial(self._note, family))
+        note = partial(self._note, family)
+        return half_branch(family, start, low, high, settings, single is not None, note, single)
 
     def _note(self, family: Family, one: Bifurcation) -> None:
         if self._leads_on(family, one) and self.scope.low <= family.values(one.point.u)[0] <= self.scope.high:
@@ -88,7 +95,7 @@ class _Doubled:
         """Return whether the other branch at a bifurcation is one of twice the period, within the limit of periods."""
         return one.kind == DOUBLING and 2 * family.period <= self.scope.max_period
 
-    def beside(self, queries: Sequence[Query]) -> Iterable[Begun[Half | None]]:
+    def beside(self, queries: Sequence[Query]) -> Iterable[Begun[Half]]:
         """Begin branches at the doublings that no branch holds; return all that have been begun."""
         self._latest |= {query.problem: query.u for query in queries if isinstance(query.problem, OrbitProblem)}
         held = {self._nearest(*latest) for latest in self._latest.items()} if self._located else set()
@@ -118,13 +125,13 @@ class _Doubled:
             what,
             beside=self.beside,
         )
-        return [(b, one, half) for (b, one), half in zip(ends, halves, strict=True) if half is not None]
+        return [(b, one, half) for (b, one), half in zip(ends, halves, strict=True)]
 
-    def _branch(self, family: Family, one: Bifurcation) -> Steps[Half | None]:
+    def _branch(self, family: Family, one: Bifurcation) -> Steps[Half]:
         start = yield from doubled_start(family, one)
         if start is None:
-            return None
-        return (yield from self.half(replace(family, period=2 * family.period), start, from_bifurcation=True))
+            return Half(Trace([one.point], "stuck"))
+        return (yield from self.half(replace(family, period=2 * family.period), start, one.point))
 
 
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
@@ -281,10 +288,14 @@ def _switch(branches: list[Branch], doubled: _Doubled, what: str) -> None:
     """Follow the new branches that start at period doublings and branch points of the known branches."""
     ends = [(branch, one) for branch in branches for one in branch.bifurcations if one.child is None]
     for parent, one, half in doubled.follow(branches, what):
-        if len(half.trace.points) < 5 or one.child is not None:
+        n_points, end = len(half.trace.points), half.trace.end
+        if one.child is not None or (n_points == 1 and end == "bound"):
             continue
         family = replace(parent.family, period=2 * parent.family.period)
-        child = Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end), one)
+        child = Branch(family, half.trace.points, half.bifurcations, ("start", end), one)
+        if n_points < LEAST_POINTS and end == "stuck":
+            one.stuck = child
+            continue
         one.child, one.criticality = child, _criticality(one, child, 0)
         branches.append(child)
         if child.ends[1] == "period_halving":

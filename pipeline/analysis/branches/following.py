@@ -17,6 +17,7 @@ from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneP
 from pipeline.analysis.branches.resting import RestSettings, last_orbit, saddles_near
 from pipeline.analysis.branches.steep_orbits import (
     CutProblem,
+    cut_doubled,
     cut_where_steep,
     is_divided,
     is_small,
@@ -224,9 +225,11 @@ def half_branch(
     settings: Settings,
     from_bifurcation: bool = False,
     tell: Callable[[Bifurcation], None] = lambda _: None,
+    single: Point | None = None,
 ) -> Steps[Half]:
     """Follow a branch from a point in one direction to its end. If the last point is beyond a parameter bound, move it
-    onto the bound. `tell` is called with each bifurcation as soon as it is located.
+    onto the bound. `tell` is called with each bifurcation as soon as it is located. At a period doubling, `single` is
+    the orbit of half the period.
     """
     if not family.period:
         settings = replace(settings, longest_step=settings.longest_at_rest)
@@ -241,7 +244,7 @@ def half_branch(
         watch.between,
         lambda here: beyond_strobe(problem, here, settings),
     )
-    steep = yield from _past_steep(family, found, watch, stop, settings)
+    steep = yield from _past_steep(family, found, watch, stop, settings, single)
     n_last = len(found.points) - 2
     if found.end == "bound":
         own: Problem = problem if steep is None else steep[0]
@@ -278,24 +281,35 @@ def leads_nowhere(family: Family, points: list[Point]) -> bool:
 
 
 def _past_steep(
-    family: Family, found: Trace, watch: Watch, stop: _Stop, settings: Settings
+    family: Family, found: Trace, watch: Watch, stop: _Stop, settings: Settings, single: Point | None
 ) -> Steps[tuple[CutProblem, list[Point]] | None]:
-    """Follow a branch on by multiple shooting where it is stuck since its orbits are steep; in place.
+    """Follow a branch on by multiple shooting where it is stuck since its orbits are steep; in place. A doubled branch
+    that is stuck beside its doubling begins there anew, as its points are too near to each other to tell its direction.
 
     Returns the last equations with the last points in their unknowns; None if the branch is not followed on.
     """
     last: tuple[CutProblem, list[Point]] | None = None
     is_cut = found.end == "stuck" and _may_be_cut(family, found.points)
+    if single is not None and not _is_beside(found.points[-1], found.points[0], settings):
+        single = None
+    if is_cut and single is not None:
+        found.points[1:], watch.found = [], []
     while is_cut:
-        problem, u = whole_orbit(family, found.points[-1]) if last is None else (last[0], last[1][-1].u)
-        cut = yield from cut_where_steep(problem, u, found.points[-1].tangent, settings)
+        begins = single if last is None else None
+        if begins is not None:
+            cut = yield from cut_doubled(replace(family, period=family.period // 2), begins, settings)
+        else:
+            problem, u = whole_orbit(family, found.points[-1]) if last is None else (last[0], last[1][-1].u)
+            cut = yield from cut_where_steep(problem, u, found.points[-1].tangent, settings)
         found.end = "stuck"
         if cut is None:
             break
         problem, start = cut
         if last is None and not (is_steep(found.points[-1], family) or is_divided(problem)):
             break  # the period grows, but not on a canard
-        own = Watch(problem, settings, n_steps=len(found.points) - 1)
+        if begins is not None:
+            found.points = [problem.plain(start)]
+        own = Watch(problem, settings, skip_first=begins is not None, n_steps=len(found.points) - 1)
         n_left = settings.max_points - len(found.points) + 1
         rest = replace(settings, max_points=n_left, longest_step=settings.longest_cut)
         piece = yield from trace(problem, start, rest, _StopCut(problem, stop, found.points), own.between)
@@ -303,6 +317,11 @@ def _past_steep(
         watch.found += [replace(one, point=problem.plain(one.point)) for one in own.found]
         last = problem, piece.points[-2:]
     return last
+
+
+def _is_beside(point: Point, start: Point, settings: Settings) -> bool:
+    """Return whether a branch is no further from its start than its first step leads."""
+    return bool(np.linalg.norm(point.u - start.u) < settings.first_step)
 
 
 @dataclass(frozen=True, eq=False)

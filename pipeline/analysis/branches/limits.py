@@ -28,6 +28,7 @@ from magpend_core.equilibria import find_equilibria
 from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
 from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.bifurcations import Bifurcation
 from pipeline.analysis.branches.following import (
     Branch,
     Limit,
@@ -338,7 +339,8 @@ def _fold(family: Family, value: float, state: np.ndarray) -> Fold | None:
 
 def cut_ends(branches: Sequence[Branch], word: str = FREQUENCY, settings: LimitSettings = LimitSettings()) -> list[str]:
     """Return text lines on the ends at which a branch was cut off: one that is stuck, with what was met there, one with
-    too many points, and those at the bounds of the parameter, together. The rate has the specification's `word`.
+    too many points, and those at the bounds of the parameter, together; and on doubled branches that are stuck where
+    they begin. The rate has the specification's `word`.
     """
     lines, beyond = [], dict[str, list[int]]()
     for i, branch in enumerate(branches):
@@ -351,7 +353,19 @@ def cut_ends(branches: Sequence[Branch], word: str = FREQUENCY, settings: LimitS
                 lines.append(f"branch {i} at {at}: {len(points)} points, no more are followed; see the rest by --start")
             elif why == "bound":
                 beyond.setdefault(at, []).append(i)
+        lines += [_begun(i, one, word, settings) for one in branch.bifurcations if one.stuck and not one.child]
     return [*lines, *(f"{_numbered(ones)} beyond {at}, a bound of the interval" for at, ones in beyond.items())]
+
+
+def _begun(i: int, one: Bifurcation, word: str, settings: LimitSettings) -> str:
+    """Describe the doubled branch at a period doubling of branch `i` that is stuck where it begins."""
+    branch: Branch = one.stuck
+    points = towards(branch, 1)
+    at = place_in_words(branch.family.free[0], word, branch.family.values(points[0].u)[0])
+    met = "; ".join(_met(branch, points, settings))
+    return (
+        f"the branch of period {branch.family.period} that leaves branch {i} at {at}, after {len(points)} points: {met}"
+    )
 
 
 def _numbered(branches: Sequence[int]) -> str:

@@ -309,6 +309,22 @@ class CutProblem:
         problem = replace(self, shares=shares, returns=np.insert(self.returns, own + 1, self.returns[own]))
         return problem, problem.packed_up(nodes, seconds, at)
 
+    def doubled(self, point: Point) -> tuple[CutProblem, np.ndarray, np.ndarray]:
+        """Return the equations of the orbit at a period doubling, traversed twice, with its unknowns and the tangent of
+        the branch of twice the period. Along the tangent, the second turn is displaced as the first, but backwards.
+        """
+        nodes, seconds, at = self.parts(point.u)
+        returns = np.concatenate([self.returns, self.returns + self.family.period])
+        family = replace(self.family, period=2 * self.family.period)
+        problem = replace(self, family=family, shares=np.tile(self.shares, 2), returns=returns, unit=2.0 * self.unit)
+        n, backwards = self.system.n_states, point.value.derivative[:, :-1].copy()
+        last = (len(nodes) - 1) * n
+        backwards[last : last + n, :n] *= -1.0
+        away, longer, _ = self.parts(np.append(np.linalg.svd(backwards)[2][-1], 0.0))
+        tangent = problem.packed_up(np.concatenate([away, -away]), np.concatenate([longer, -longer]), 0.0)
+        u = problem.packed_up(np.tile(nodes, (2, 1)), np.tile(seconds, 2), at)
+        return problem, u, tangent / np.linalg.norm(tangent)
+
     def plain(self, point: Point) -> Point:
         """Return a point in the unknowns of `OrbitProblem`: the section point and the parameter."""
         n, value = self.system.n_states, point.value
@@ -380,3 +396,15 @@ def cut_where_steep(
     tangent = tangent * (1.0 if np.append(nodes[0], at) @ along >= 0.0 else -1.0)
     point = yield from correct(problem, u, tangent, settings)
     return None if point is None else (problem, point)
+
+
+def cut_doubled(single: Family, at: Point, settings: Settings) -> Steps[tuple[CutProblem, Point] | None]:
+    """Return the start of the doubled branch at a period doubling, with the orbit cut where it is steep; None on
+    failure.
+    """
+    cut = yield from cut_where_steep(*whole_orbit(single, at), at.tangent, settings)
+    if cut is None:
+        return None
+    problem, u, tangent = cut[0].doubled(cut[1])
+    value = yield Query(problem, u)
+    return (problem, Point(u, tangent, value, 0)) if value.is_finite else None

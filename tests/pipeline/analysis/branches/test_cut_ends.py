@@ -14,10 +14,14 @@ from pipeline.analysis.branches.arclength import Point, crawls
 from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.following import leads_nowhere
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.lockstep import within
 from pipeline.analysis.branches.problems import STEEP, Family, Value, _steep_step
 from pipeline.layout.vocabulary import model_attribute, section_attributes
+from tests.core.flows import model_of
 
 
 def test_cut_words():
@@ -119,3 +123,35 @@ def test_within():
     assert run(within(5, asks(5))) == "all"
     assert run(within(4, asks(5))) is None
     assert run(within(0, asks(0))) == "all"
+
+
+def doubled(equations, low, high, **parameters):
+    """Branches of a map from its fixed point 0 at `low`, and what is said on their ends."""
+    model = model_of(equations, parameters, kind="map")
+    family = Family(model.system, 1, 1.0, model.load().pack(), ("e",), (1.0,))
+    branches = explore([Start(family, np.array([0.0]), low)], Scope(low, high, 2))
+    return branches, str(dataset_of(branches, "e", model.load()).attrs["left_out"]).splitlines()
+
+
+@pytest.mark.slow
+def test_explore__says_that_a_doubled_branch_is_stuck_where_it_begins():
+    """The orbits +-x of period 2 have x = sqrt(e), and the map jumps at x = 3e-7."""
+    (parent,), left_out = doubled({"x": "-(1 + e)*x + x**3 + where(x**2 < 9e-14, 0, 1)"}, -0.01, 0.3, e=0.0)
+    (doubling,) = parent.bifurcations
+    assert (doubling.kind, doubling.child) == ("period_doubling", None)
+    (line,) = [line for line in left_out if "period 2" in line]
+    assert line.startswith("the branch of period 2 that leaves branch 0 at e = ")
+    assert "Newton's method found no next orbit" in line
+
+
+@pytest.mark.slow
+def test_explore__keeps_a_doubled_branch_that_soon_leaves_the_interval():
+    """The orbits +-x of period 2 have x = sqrt(e), which is 9e-4 on the bound, less than a first step."""
+    (parent, child), left_out = doubled({"x": "-(1 + e)*x + x**3"}, -0.01, 8.1e-7, e=0.0)
+    (doubling,) = parent.bifurcations
+    assert doubling.child is child
+    assert child.origin is doubling
+    assert (len(child.points), child.ends, child.bifurcations) == (2, ("start", "bound"), [])
+    # a residual of 1e-10 is 6e-8 of e, and 3e-5 of x
+    assert abs(child.family.state(child.points[-1].u)[0]) == pytest.approx(9e-4, abs=3e-5)
+    assert left_out[1:] == ["branches 0, 1 beyond e = 8.1e-07, a bound of the interval"]
