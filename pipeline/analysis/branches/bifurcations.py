@@ -132,6 +132,7 @@ class Watch:
     found: list[Bifurcation] = field(default_factory=list)
     n_steps: int = 0
     tell: Callable[[Bifurcation], None] = lambda _: None  # called with each one at once
+    halves: Callable[[Point, Point], bool] = lambda *_: False  # whether a step passes an orbit of half the period
     _last: Point | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
@@ -148,6 +149,9 @@ class Watch:
         if long and not _explains(kinds, n_unstable(b) - n_unstable(a)):
             return False
         if long and turns_twice(a, b):
+            return False
+        # an orbit of half the period has squares as multipliers, none of them -1: a doubling lies before it
+        if long and TESTS[DOUBLING](a) < 0.0 and self.halves(a, b):
             return False
         if step > short and any(self._turned_back(kind, a, b, step) for kind in (BRANCHING, HOPF) if kind not in kinds):
             return False

@@ -210,7 +210,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=14,
+    version=15,
 )
 
 COEFFICIENTS = {

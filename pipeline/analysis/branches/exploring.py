@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from magpend_core.orbits import section_map
+from magpend_core.orbits import scaled_distance, section_map
 from magpend_core.poincare import Section, section_of
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
@@ -251,20 +251,27 @@ def _adopt(branches: Sequence[Branch]) -> list[Start]:
 
 def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifurcation | None:
     """Find the period doubling at which a branch ends. It lies on a branch of half the period, within a few steps of
-    the end.
+    the end; among several, its orbit is the most like the last one.
     """
     end, inner = (branch.points[0], branch.points[1]) if which == 0 else branch.points[:-3:-1]
     reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
-    best, nearest = None, reach
+    found = []
     for other in branches:
         if 2 * other.family.period != branch.family.period or not same_others(other.family, branch.family):
             continue
         for one in other.bifurcations:
             if one.kind == DOUBLING:
                 away = max(gap(branch.family, end.u, one.point), abs(end.u[-1] - one.point.u[-1]))
-                if away < nearest:
-                    best, nearest = one, away
-    return best
+                if away < reach:
+                    found.append(one)
+    return min(found, key=lambda one: _apart(branch.family, end, one.point), default=None)
+
+
+def _apart(family: Family, doubled: Point, single: Point) -> float:
+    """Return the largest scaled distance between the section points of an orbit and those of one of half its period."""
+    away = np.array([scaled_distance(single.value.images, x, family.system) for x in doubled.value.images])
+    n, each = len(single.value.images), np.arange(len(away))
+    return min(float(away[each, (each + k) % n].max()) for k in range(n))
 
 
 def _half_orbit(branch: Branch, which: int) -> Start:

@@ -106,12 +106,13 @@ class _Stop:
     low: float
     high: float
     beyond: int = 0
+    may_close: bool = True
 
     def __call__(self, points: list[Point]) -> str:
         here = points[-1]
         if not self.low <= self.family.values(here.u)[0] <= self.high:
             return "bound"
-        if self._is_closed(points):
+        if self.may_close and self._is_closed(points):
             return "closed"
         if self.family.period and (end := end_of_crossings(self.family, here)):
             return end
@@ -234,7 +235,7 @@ def half_branch(
     if not family.period:
         settings = replace(settings, longest_step=settings.longest_at_rest)
     problem = problem_of(family)
-    watch = Watch(problem, settings, skip_first=from_bifurcation, tell=tell)
+    watch = Watch(problem, settings, from_bifurcation, tell=tell, halves=lambda *step: has_halved(family, [*step]))
     stop = _Stop(family, low, high, settings.beyond)
     found = yield from trace(
         problem,
@@ -308,8 +309,9 @@ def _past_steep(
         if last is None and not (is_steep(found.points[-1], family) or is_divided(problem)):
             break  # the period grows, but not on a canard
         if begins is not None:
-            found.points = [problem.plain(start)]
-        own = Watch(problem, settings, skip_first=begins is not None, n_steps=len(found.points) - 1)
+            # a section point does not tell canards apart, and a doubled branch comes back to its start by halving
+            found.points, stop = [problem.plain(start)], replace(stop, may_close=False)
+        own = Watch(problem, settings, begins is not None, n_steps=len(found.points) - 1, halves=_halves(problem))
         n_left = settings.max_points - len(found.points) + 1
         rest = replace(settings, max_points=n_left, longest_step=settings.longest_cut)
         piece = yield from trace(problem, start, rest, _StopCut(problem, stop, found.points), own.between)
@@ -317,6 +319,11 @@ def _past_steep(
         watch.found += [replace(one, point=problem.plain(one.point)) for one in own.found]
         last = problem, piece.points[-2:]
     return last
+
+
+def _halves(problem: CutProblem) -> Callable[[Point, Point], bool]:
+    """Return `has_halved` for a step of cut orbits."""
+    return lambda a, b: has_halved(problem.family, [problem.plain(a), problem.plain(b)])
 
 
 def _is_beside(point: Point, start: Point, settings: Settings) -> bool:

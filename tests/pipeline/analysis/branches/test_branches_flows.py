@@ -336,6 +336,58 @@ def test_explore__cycles_whose_peak_is_a_removable_singularity():
     assert ds["multiplier_real"].max() > 2e7
 
 
+def test_explore__doubled_branch_of_steep_cycles():
+    """One branch of period 2 joins both doublings of these cycles, though a multiplier is 9e6 where it begins. Along it
+    the cycles double four times, and turn beside two of these points. At the first one scipy finds a multiplier -1.
+    """
+    state, current = [3.5, 0.07794908, 0.4168789, 0.39370776], 9.278217390498842
+    ds = followed(
+        HODGKIN_HUXLEY, "v", state, "I", 7.84, 9.4, max_period=2, level=3.5, longest=100.0, step=0.005, I=current
+    )
+    assert ds["orbit_period"].values.tolist() == [1, 2]
+    rows = table_of(ds)
+    found = {
+        (kind, period): [row["I"] for row in rows if (row["type"], row["period"]) == (kind, period)]
+        for kind, period in {(row["type"], row["period"]) for row in rows}
+    }
+    known = {
+        ("fold", 1): [7.84654712, 7.92198549],
+        ("period_doubling", 1): [7.84953740, 7.92197768],
+        ("period_doubling", 2): [7.85068143, 7.85992281, 7.91100388, 7.92197365],
+        ("fold", 2): [7.85992281, 7.91100414],
+    }
+    assert found == {key: pytest.approx(values, abs=2e-8) for key, values in known.items()}
+    doublings = [row for row in rows if row["type"] == "period_doubling"]
+    assert [row["to_branch"] for row in doublings if row["period"] == 1] == [1, 1]
+    assert "period 2" not in ds.attrs["left_out"]
+    (k,) = np.flatnonzero(np.abs(ds["value"].values - 7.85068143) < 1e-6)
+    value, seconds = float(ds["value"][k]), float(ds["bifurcation_period_s"][k])
+
+    def rates(_, u):
+        v, m, h, n = u.reshape(4, -1)
+        return np.concatenate(
+            [
+                value - 120 * m**3 * h * (v - 115) - 36 * n**4 * (v + 12) - 0.3 * (v - 10.599),
+                0.1 * (25 - v) / np.expm1((25 - v) / 10) * (1 - m) - 4 * np.exp(-v / 18) * m,
+                0.07 * np.exp(-v / 20) * (1 - h) - h / (np.exp((30 - v) / 10) + 1),
+                0.01 * (10 - v) / np.expm1((10 - v) / 10) * (1 - n) - 0.125 * np.exp(-v / 80) * n,
+            ]
+        )
+
+    start = state = ds["bifurcation_section"].values[k, 0]
+    sizes, monodromy = 1e-5 * np.array([100.0, 1.0, 1.0, 1.0]), np.eye(4)
+    for _ in range(40):
+        beside = state[:, None] + np.hstack([np.zeros((4, 1)), np.diag(sizes), -np.diag(sizes)])
+        ends = solve_ivp(rates, (0.0, seconds / 40), beside.ravel(), "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        state, *others = ends.reshape(4, -1).T
+        monodromy = (np.subtract(others[:4], others[4:]).T / (2.0 * sizes)) @ monodromy
+    assert state == pytest.approx(start, abs=1e-6)
+    multipliers = np.linalg.eigvals(monodromy)
+    assert np.abs(multipliers + 1.0).min() < 1e-3
+    assert np.abs(multipliers - 1.0).min() < 1e-3
+    assert np.abs(multipliers).max() == pytest.approx(1.9595e3, rel=1e-3)
+
+
 def test_explore__cycles_that_come_to_touch_the_section():
     """Towards Hopf's point the same cycles shrink about z = rho - 1, until their lowest point is on z = 10."""
     ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 15.9, 24.0, level=10.0, rho=15.9959022)
