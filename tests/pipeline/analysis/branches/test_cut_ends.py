@@ -1,5 +1,6 @@
 """Ends at which branches and curves are cut off, and what was not followed, are said."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,15 +11,17 @@ from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import _no_equilibria, curves_table
-from pipeline.analysis.branches.arclength import Point, crawls
+from pipeline.analysis.branches.arclength import Point, Settings, crawls
+from pipeline.analysis.branches.bifurcations import Bifurcation, Watch
 from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
 from pipeline.analysis.branches.dataset import dataset_of
-from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.exploring import Scope, _doubling_at, explore
 from pipeline.analysis.branches.following import leads_nowhere
+from pipeline.analysis.branches.kinds import DOUBLING
 from pipeline.analysis.branches.known import Start
-from pipeline.analysis.branches.lockstep import within
+from pipeline.analysis.branches.lockstep import run_alone, within
 from pipeline.analysis.branches.problems import STEEP, Family, Value, _steep_step
 from pipeline.layout.vocabulary import model_attribute, section_attributes
 from tests.core.flows import model_of
@@ -155,3 +158,31 @@ def test_explore__keeps_a_doubled_branch_that_soon_leaves_the_interval():
     # a residual of 1e-10 is 6e-8 of e, and 3e-5 of x
     assert abs(child.family.state(child.points[-1].u)[0]) == pytest.approx(9e-4, abs=3e-5)
     assert left_out[1:] == ["branches 0, 1 beyond e = 8.1e-07, a bound of the interval"]
+
+
+def two_turns(value, first, second, multiplier=0.5):
+    """An orbit of period 2 of a map, beside the value of the parameter."""
+    images = np.array([[second], [first]])
+    own = Value(np.zeros(1), np.zeros((1, 2)), images, np.array([[multiplier]]))
+    return Point(np.array([first, value]), np.array([0.0, 1.0]), own, 0)
+
+
+def test_doubling_at__compares_whole_orbits():
+    """The branch ends beside the second orbit; a section point of the first one is nearer, the other is far away."""
+    system = SimpleNamespace(n_states=1, state_names=("x",), scales=(1.0,), is_angle=np.array([False]))
+    system.parameter_names, family = (), Family(system, 2, 1.0, np.zeros(0), ("p",), (1.0,))
+    orbits = two_turns(0.5, 1.0, 0.2), two_turns(0.5, 1.002, 3.0)
+    doublings = [Bifurcation(DOUBLING, point, 0.0, 0, 1, True, after=0) for point in orbits]
+    single = SimpleNamespace(family=family, bifurcations=doublings)
+    images = np.array([[2.99], [1.0008], [3.01], [1.0]])
+    points = [
+        Point(np.array([first, 0.5]), np.zeros(2), Value(np.zeros(1), np.zeros((1, 2)), images, np.eye(1)), 0)
+        for first in (1.1, 1.0)
+    ]
+    ended = SimpleNamespace(family=replace(family, period=4), points=points)
+    assert _doubling_at([single], ended, 1) is doublings[1]
+
+
+def test_watch__takes_a_shorter_step_where_a_doubling_lies_before_an_orbit_of_half_the_period():
+    a, b = two_turns(0.0, 1.0, 1.1, multiplier=-2.0), two_turns(0.1, 1.1, 1.0)
+    assert run_alone(Watch(None, Settings(), halves=lambda *_: True).between(a, b)) is False
