@@ -164,8 +164,10 @@ def _range(values: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 class _Motion:
-    """The motion of some cells, each with steps of its own: by the method of Bogacki and Shampine (Appl. Math. Lett. 2,
-    1989, 321), or of a stiff system by that of Shampine and Reichelt (SIAM J. Sci. Comput. 18, 1997, 1, section 3.1).
+    """Integrate the motion of some cells, each in steps of its own.
+
+    Explicit steps are those of Bogacki and Shampine (Appl. Math. Lett. 2, 1989, 321), implicit ones those of Shampine
+    and Reichelt (SIAM J. Sci. Comput. 18, 1997, 1, section 3.1).
     """
 
     def __init__(self, definition: Definition, frequency: np.ndarray, columns: Mapping[str, Any]) -> None:
@@ -182,8 +184,8 @@ class _Motion:
         return np.array([np.broadcast_to(rate, t.shape) for rate in rates.values()], np.float64)
 
     def followed(self, y: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return times (step, cell) and states (step, state, cell) from the starts (state, cell) on, of the steps that
-        come farther.
+        """Return times (step, cell) and states (step, state, cell) from the starts (state, cell) on. A cell is followed
+        by explicit steps, or by implicit ones if these come much farther.
         """
         times, path, h = self._path(y, ends, self._step)
         if len(y) > MOST_IMPLICIT:

@@ -10,18 +10,18 @@ import numpy as np
 def with_jumps(
     fly: Callable[[list[int], list[np.ndarray]], Sequence[np.ndarray]], times: list[np.ndarray], sizes: Sequence[float]
 ) -> list[np.ndarray]:
-    """Return the states of motions at the instants `times`, to which those are added that their jumps need.
+    """Return the states of motions at the instants `times`, after instants have been added where a state jumps.
 
     Parameters
     ----------
     fly
-        From numbers of motions and the instants of each to the states of each, (n, n_states).
+        Takes the numbers of some motions and the instants of each; returns the states of each, (n, n_states).
     times
-        Rising instants of each motion; intervals are divided in place.
+        Rising instants of each motion. Instants are added in place.
     sizes
         Units of the states.
     """
-    rounds = 5
+    rounds = 5  # a jump that takes 32**-5 of an interval is resolved
     rows = list(range(len(times)))
     paths = list(fly(rows, times))
     for _ in range(rounds):
