@@ -31,6 +31,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from pipeline.explorer import html
 from pipeline.explorer.live.messages import MOST_BYTES, number_in
 from pipeline.explorer.security import Guard, Rate, headers_of, new_token
+from pipeline.runs.stopping import Stopped, first_signal
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
 
@@ -454,4 +455,7 @@ async def _answer(service: Service, taken: socket.socket) -> None:
     server = httpserver.HTTPServer(application(service), **LIMITS)
     server.add_socket(taken)
     service.answering.warm()
-    await asyncio.Event().wait()
+    # a package that is imported meanwhile may catch the exception of a signal
+    while (number := first_signal()) is None:
+        await asyncio.sleep(1.0)
+    raise Stopped(number)
